@@ -25,7 +25,15 @@ from harness import options, run
 import dlo_casadi as dlo
 
 STD, RATE, DURATION = 4e-4, 100.0, 1.2
-HIDDEN = ("air_drag", "dynamic_stiffness", "lumped_mass")
+# Hidden effects, their parameter that vanishes, and where.
+HIDDEN = {
+    "air_drag": ("coefficient", 0.0),
+    "dynamic_stiffness": ("factor", 1.0),
+    "lumped_mass": ("mass", 0.0),
+}
+# Standard deviations from which on an effect shows: by chance one of 40 places and kinds exceeds it
+# in less than one of a hundred sessions.
+SHOWN = 4.0
 
 
 class Case(NamedTuple):
@@ -40,19 +48,35 @@ class Case(NamedTuple):
 
 
 class Row(NamedTuple):
-    """What was hidden and found, whether EI and tau are inside, held-out error over noise."""
+    """What was hidden and found, whether EI and tau are inside, held-out error over noise.
+
+    `shown`: of a missed effect, its value over its standard deviation. `told`: by rivals among the
+    still shapes, the log evidence against them without and with the motions.
+    """
 
     hidden: str
     found: tuple[str, ...]
     stiffness_inside: bool
     damping_inside: bool
     held_out: float
+    shown: float
+    told: dict[str, tuple[float, float]]
     seconds: float
 
     @property
     def right(self) -> bool:
         """Whether exactly what was hidden was found."""
         return self.found == ((self.hidden,) if self.hidden else ())
+
+    @property
+    def wrong(self) -> bool:
+        """Whether something is named that is not there."""
+        return bool(set(self.found) - {self.hidden})
+
+    @property
+    def shows(self) -> bool:
+        """Whether something hidden can be seen."""
+        return bool(self.hidden) and (self.hidden in self.found or self.shown > SHOWN)
 
 
 def truth(
@@ -68,7 +92,7 @@ def truth(
     declared = dlo.Cable(**own, bending_stiffness=stiffness * random.uniform(0.7, 1.4))
     true = {**own, "bending_stiffness": stiffness}
     damping = {"damping_time": random.uniform(0.01, 0.04)}
-    name = str(random.choice(HIDDEN)) if case.hidden else ""
+    name = str(random.choice(list(HIDDEN))) if case.hidden else ""
     size = 10 ** random.uniform(0, 0.7)
     if name == "air_drag":
         damping[name] = 0.3 * size
@@ -129,14 +153,8 @@ def work(case: Case) -> Row:
                 **held,
             )
         )
-    session = dlo.Session(
-        declared,
-        poses,
-        motions=motions,
-        std=STD,
-        **known,
-    )
-    found = session.fit()
+    measured: dict[str, Any] = {"motions": motions, "std": STD, **known}
+    found = dlo.Session(declared, poses, **measured).fit()
     last = found.stages[-1]
     inside = []
     for key, value in (("bending_stiffness", true), ("damping_time", damping)):
@@ -144,27 +162,39 @@ def work(case: Case) -> Row:
         inside.append((low or 0.0) <= value[key] <= (np.inf if high is None else high))
     error = np.nan if last.motion is None else last.motion.rmse_held_out
     ratio = float(error or np.nan) / (STD * np.sqrt(d))
-    names = tuple(effect.name for effect in found.effects)
-    return Row(name, names, *inside, ratio, process_time() - begun)
+    names, seconds, shown = tuple(x.name for x in found.effects), process_time() - begun, np.nan
+    if name and name not in names:
+        measured |= {"model": {"effects": [name]}, "diagnosis": {"enabled": False}}
+        key, none = HIDDEN[name]
+        size = dlo.Session(declared, poses, **measured).fit().params[f"{name}.{key}"]
+        shown = abs(size.value - none) / (size.std or np.inf)
+    told = {key: both for effect in found.effects for key, both in effect.told_apart.items()}
+    return Row(name, names, *inside, ratio, shown, told, seconds)
 
 
 def line(case: Case, row: Row, seconds: float) -> str:
     """One line of the table."""
     found = ", ".join(row.found) or "nothing"
+    if np.isfinite(row.shown):
+        found += f" (it shows by {row.shown:.1f} std)"
+    for name, (still, moving) in row.told.items():
+        found += f" (told from {name} by {still:.1f} without motions, {moving:.0f} with them)"
+    mark = "  WRONG" if row.wrong else "  MISSED" if row.shows and not row.right else ""
     return (
         f"{case}: {row.hidden or 'nothing'} -> {found}; EI "
         f"{'inside' if row.stiffness_inside else 'OUTSIDE'}, tau "
         f"{'inside' if row.damping_inside else 'OUTSIDE'}, held out {row.held_out:.2f} x noise, "
-        f"{row.seconds:.0f} s{'' if row.right else '  WRONG'}"
+        f"{row.seconds:.0f} s{mark}"
     )
 
 
 def summary(rows: Sequence[Row]) -> str:
     """Counts."""
-    right = sum(row.right for row in rows)
+    right, wrong, shown = (sum(getattr(x, y) for x in rows) for y in ("right", "wrong", "shows"))
     inside = [sum(getattr(row, f"{x}_inside") for row in rows) for x in ("stiffness", "damping")]
     return (
-        f"{right} of {len(rows)} right; EI inside in {inside[0]}, tau in {inside[1]}; held out "
+        f"{right} of {len(rows)} right, {wrong} name what is not there, {shown} hidden show; EI "
+        f"inside in {inside[0]}, tau in {inside[1]}; held out "
         f"{float(np.median([row.held_out for row in rows])):.2f} x noise (median); "
         f"{float(np.median([row.seconds for row in rows])):.0f} s of processor time (median)"
     )
@@ -178,8 +208,10 @@ def main() -> int:
     seeds = range(1000 * chosen.seed, 1000 * chosen.seed + chosen.count)
     cases = [Case(where, chosen.hidden, seed) for where in chosen.where for seed in seeds]
     rows = run(work, cases, chosen, line, summary=summary)
-    wrong = sum(not row.right for row in rows) / len(rows)
-    return int(wrong > (0.08 if chosen.hidden else 0.01))
+    wrong, shown = sum(row.wrong for row in rows), [row for row in rows if row.shows]
+    missed = sum(not row.right for row in shown)
+    few = wrong > (0.02 if chosen.hidden else 0.01) * len(rows)
+    return int(few or missed > 0.08 * len(shown))
 
 
 if __name__ == "__main__":

@@ -1,24 +1,29 @@
-"""Search for what a model lacks in motion: drag, friction, another stiffness, a clock's delay.
+"""Search for what a model lacks in motion: drag, friction, another stiffness, a weight, a delay.
 
 At the fit of still poses and motions, all candidates are added at the values at which they vanish.
 One linearisation then gives, with H the Hessian of all unknowns and g the gradient, the score
 
     T = g_c^2 / (H_cc - H_ca H_aa^-1 H_ac)
 
-of each: twice what it would gain, to first order, with all other unknowns fitted again. The best
-are fitted. What is then left of a motion is not independent in time: a gain counts as divided by
-c = m' J m / m' H m, with the variance J of the gradient (`motion_fit`) and the change m of all
-unknowns along the candidate. The best one is added if its gain exceeds its price, until none does.
+of each: twice what it would gain, to first order, with all other unknowns fitted again. A candidate
+that the model has within a tolerance is free of it, and gains what the tolerance costs now, too.
+The best are fitted. What is then left of a motion is not independent in time: a gain counts as
+divided by c = m' J m / m' H m, with the variance J of the gradient (`told_by`) and the change m of
+all unknowns along the candidate. The best one is added if it is significant, as in the search among
+still poses, until none is. No misfit is asked for: an effect of six standard deviations leaves a
+thousand residuals at 1.02 times their noise.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import chdtri
 
 from dlo_casadi.diagnosis.candidates import Candidate, candidates, setup_of
+from dlo_casadi.diagnosis.gram import sidak, survival
 from dlo_casadi.effects import IN_MOTION, Load
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import EXPLAINED
@@ -32,18 +37,17 @@ from dlo_casadi.estimation.motion_fit import (
     with_model,
 )
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.thresholds import EVIDENCE_APART, SCANS_PER_TEST, SIGNIFICANCE
 
-# Gain of the log likelihood that an effect of one parameter must exceed: twice it, 15, is exceeded
-# by chance in 1e-4 of cases, and by one of seven candidates in less than 1e-3.
-PRICE = 7.5
-# Candidates that are fitted in each round, and the share of the best score that they need.
-REFITTED, NEAR = 3, 0.3
+# Candidates that are fitted in each round; the share of the best score that they need, and that of
+# what a significant one has: scores are of first order.
+REFITTED, NEAR, ENOUGH = 3, 0.3, 0.75
+# Step, in trial places, between those at which a weight is scored; its fit then moves it.
+_APART = 3
 # Information below which a candidate is not seen at all.
 _UNSEEN = 1e-6
 # Most effects that are added.
 MOST = 3
-# Gain by which the best of two must exceed the other to be told apart.
-APART = 3.0
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,8 @@ class AddedInMotion:
     ----------
     gain : float
         Of the log likelihood.
+    p_value : float
+        Of that gain as the best of all candidates and places.
     rivals : tuple of str
         Other effects that gain nearly as much.
     before, after : float [m]
@@ -62,6 +68,7 @@ class AddedInMotion:
 
     candidate: Candidate
     gain: float
+    p_value: float
     rivals: tuple[str, ...]
     before: float
     after: float
@@ -112,12 +119,14 @@ def search_in_motion(
     fit: MotionFit,
     exclude: Sequence[str] = (),
     step: Callable[[str, int, int], None] = lambda name, done, total: None,
+    significance: float = SIGNIFICANCE,
 ) -> InMotion:
-    """Add effects until none gains more than its price.
+    """Add effects until none is significant.
 
     `fit`: of the declared model over a first stretch, which hardly tells what is missing. The later
-    a fit looks, the farther off what is missing drives it: at the end of each of STRETCHES the
-    candidates are compared with the model as it is, all from where the stretch before has left it.
+    a fit looks, the farther off what is missing drives it: at the end of each of STRETCHES that the
+    model as it is does not explain the candidates are compared with it, all from where the stretch
+    before has left it; and at the last one, where it explains them, from its minimum.
     """
     now, added, first = fit, list[AddedInMotion](), dict[str, float]()
     before: MotionFit | None = None
@@ -128,11 +137,13 @@ def search_in_motion(
             now = joined(start.fit, start.motions, start.std, end)
         while len(added) < MOST and (end == np.inf or now.chi2_per_dof > EXPLAINED):
             step("search for what motion lacks", len(added), MOST)
-            scores = scored(start, in_motion_only(start.fit.model, exclude))
-            if now.chi2_per_dof > EXPLAINED:
-                scores |= heavy(start, exclude)
+            start = start if now.chi2_per_dof > EXPLAINED else now
+            moving = in_motion_only(start.fit.model, exclude)
+            weights = heavy(start.fit.model, exclude)
+            scores = scored(start, moving) | scored_by_place(start, weights)
             first = first or {name: one.value for name, one in scores.items()}
-            chosen = _best(start, now, scores)
+            tried = sum(max(1.0, len(x.scans) / SCANS_PER_TEST) for x in (*moving, *weights))
+            chosen = _best(start, now, scores, sidak_level(significance, tried), tried)
             if chosen is None:
                 break
             before = before or _whole(now)
@@ -150,27 +161,38 @@ def _whole(now: MotionFit) -> MotionFit:
         return now
 
 
+def sidak_level(significance: float, tried: float) -> float:
+    """Significance of one of so many independent tests of which the best one has that given."""
+    return float(-np.expm1(np.log1p(-significance) / tried))
+
+
 def scored(now: MotionFit, listed: Sequence[Candidate]) -> dict[str, Score]:
     """Scores of candidates by name."""
     if not listed:
         return {}
     model = now.fit.model
     for item in listed:
-        model = item.add_to(model)
+        model = model if item.nuisance else item.add_to(model)
     return _scores(with_model(now, model, {}), listed)
 
 
-def heavy(now: MotionFit, exclude: Sequence[str] = ()) -> dict[str, Score]:
-    """Best score over their places of effects that have a mass; a weight swings slower.
+def heavy(model: CableModel, exclude: Sequence[str] = ()) -> list[Candidate]:
+    """Candidates that have a mass: still shapes know them, too, but a weight swings slower."""
+    found = candidates(model, setup_of(model), exclude)
+    return [
+        item
+        for item in found
+        if isinstance(item.effect, Load)
+        and type(item.effect).masses is not Load.masses
+        and not item.nuisance
+    ]
 
-    Still shapes know them, too, but a motion may be the first to show them.
-    """
+
+def scored_by_place(now: MotionFit, listed: Sequence[Candidate]) -> dict[str, Score]:
+    """Best score of each candidate over its places."""
     found: dict[str, Score] = {}
-    for item in candidates(now.fit.model, setup_of(now.fit.model), exclude):
-        effect = item.effect
-        if not isinstance(effect, Load) or type(effect).masses is Load.masses or item.nuisance:
-            continue
-        for scan in item.scans:
+    for item in listed:
+        for scan in item.scans[_APART // 2 :: _APART]:
             try:
                 extended = with_model(now, item.add_to(now.fit.model), scan)
             except EstimationError:
@@ -185,19 +207,24 @@ def _scores(
     extended: MotionFit, listed: Sequence[Candidate], asked: Sequence[str] | None = None
 ) -> dict[str, Score]:
     """Scores of the candidates that a model has; `asked`: of their parameters, all by default."""
-    unknowns, theta = extended.fit.problem.unknowns, extended.fit.point.theta
+    problem, theta = extended.fit.problem, extended.fit.point.theta
+    unknowns, names = problem.unknowns, list(problem.unknowns.names)
     told, slope, _ = told_by(extended)
     still = extended.fit.normal
-    hessian, gradient = told + still.hessian, slope + still.gradient
-    names = list(unknowns.names)
-    new = [names.index(name) for item in listed for name in item.frees]
-    old = [k for k in range(len(names)) if k not in new]
-    inverse = np.linalg.pinv(hessian[np.ix_(old, old)], hermitian=True)
+    mean, precision = unknowns.prior(problem.priors.roughness_std)
+    added = {name for item in listed if not item.nuisance for name in item.frees}
     lower, upper = unknowns.bounds
     scores: dict[str, Score] = {}
     for item in listed:
         at = [names.index(name) for name in asked or item.frees]
-        arm = inverse @ hessian[np.ix_(old, at)]
+        old = [k for k, name in enumerate(names) if name not in added and k not in at]
+        hessian, gradient, costs = told + still.hessian, slope + still.gradient, 0.0
+        if item.nuisance:  # what holds it within its tolerance is no evidence against it
+            gap, own = theta[at] - mean[at], precision[np.ix_(at, at)]
+            hessian[np.ix_(at, at)] -= own
+            gradient[at] -= own @ gap
+            costs = float(gap @ own @ gap)
+        arm = np.linalg.pinv(hessian[np.ix_(old, old)], hermitian=True) @ hessian[np.ix_(old, at)]
         own = hessian[np.ix_(at, at)] - hessian[np.ix_(at, old)] @ arm
         slope_of = gradient[at] - arm.T @ gradient[old]
         if not np.diag(own).min() > _UNSEEN:
@@ -205,7 +232,7 @@ def _scores(
         move = -np.linalg.solve(own, slope_of)
         value = np.clip(theta[at] + move, lower[at], upper[at])
         move = value - theta[at]
-        score = float(-2 * slope_of @ move - move @ own @ move)
+        score = float(-2 * slope_of @ move - move @ own @ move) + costs
         full = theta.copy()
         full[at] = value
         p = dict(zip(unknowns.model.names, unknowns.p(full), strict=True))
@@ -227,25 +254,42 @@ def _excess(fit: MotionFit, item: Candidate) -> float:
 
 
 def _best(
-    start: MotionFit, now: MotionFit, scores: dict[str, Score]
+    start: MotionFit,
+    now: MotionFit,
+    scores: Mapping[str, Score],
+    level: float,
+    tried: float,
 ) -> tuple[MotionFit, AddedInMotion] | None:
-    """The best candidate, fitted from `start`; None if none gains its price over `now`."""
+    """The best candidate, fitted from `start`; None if none is significant beside `now`.
+
+    `level`: significance of one of `tried` tests. A gain counts beyond what a significant one has.
+    """
     order = sorted(scores.values(), key=lambda one: -one.value)
-    least = max(2 * PRICE, NEAR * order[0].value) if order else np.inf
+    likely = [
+        one
+        for one in order
+        if one.value > max(2 * ENOUGH * _price(one.candidate, level), NEAR * order[0].value)
+    ]
     fitted: list[tuple[float, Candidate, MotionFit]] = []
-    for one in [x for x in order if x.value > least][:REFITTED]:
+    for one in likely[:REFITTED]:
         item, model = one.candidate, one.candidate.add_to(start.fit.model)
         try:
             trial = rejoined(start, model, one.values)
         except EstimationError:
             continue
         gain = (now.objective - trial.objective) / _excess(trial, item)
-        fitted.append((gain - PRICE * len(item.frees), item, trial))
+        fitted.append((gain - _price(item, level), item, trial))
     if not fitted:
         return None
     net, item, trial = max(fitted, key=lambda x: x[0])
     if net <= 0:
         return None
-    rivals = tuple(x.name for gain, x, _ in fitted if x is not item and gain > net - APART)
-    gain = net + PRICE * len(item.frees)
-    return trial, AddedInMotion(item, gain, rivals, now.rmse, trial.rmse)
+    rivals = tuple(x.name for gain, x, _ in fitted if x is not item and gain > net - EVIDENCE_APART)
+    gain = net + _price(item, level)
+    p_value = sidak(survival(2 * gain, len(item.frees), np.inf), tried)
+    return trial, AddedInMotion(item, gain, p_value, rivals, now.rmse, trial.rmse)
+
+
+def _price(item: Candidate, level: float) -> float:
+    """Gain of the log likelihood by chance with this probability."""
+    return float(chdtri(len(item.frees), level)) / 2

@@ -331,20 +331,23 @@ def _is_load(screened: Screened) -> bool:
     return isinstance(screened.candidate.effect, PointLoad)
 
 
-def _confirm_load(base: Fit, best: Confirmed, screened: Screened) -> Confirmed | None:
-    """Refit with a load in place of another one, from its place and forces."""
-    model, effect = best.fit.model, best.candidate.effect
+def load_instead(fit: Fit, own: Candidate, other: Candidate) -> dict[str, float]:
+    """Parameters of a load with the place and the forces of a fit's own one."""
+    model, effect = fit.model, own.effect
     assert isinstance(effect, PointLoad)
-    known = {
-        q.name: best.fit.value(f"{effect.label}.{q.name}") for q in effect.parameters(model.cable)
-    }
+    known = {q.name: fit.value(f"{effect.label}.{q.name}") for q in effect.parameters(model.cable)}
     params = {name: ca.SX(value) for name, value in known.items()}
     gravity, position = ca.SX(ca.DM(model.gravity)), effect.place(known)
     at = ca.SX.sym("r", len(model.gravity))
     law = ca.Function("force", [at], [effect.force(at, gravity, params)])
-    forces = np.array([np.array(law(place)).ravel() for place in places_in(best.fit, position)])
-    values = start_from(best.fit, position, forces, screened.candidate)
-    without = best.candidate.remove_from(model, base.model)
+    forces = np.array([np.array(law(place)).ravel() for place in places_in(fit, position)])
+    return start_from(fit, position, forces, other)
+
+
+def _confirm_load(base: Fit, best: Confirmed, screened: Screened) -> Confirmed | None:
+    """Refit with a load in place of another one, from its place and forces."""
+    values = load_instead(best.fit, best.candidate, screened.candidate)
+    without = best.candidate.remove_from(best.fit.model, base.model)
     larger, ceiling = screened.candidate.add_to(without), ceiling_beside(best.fit)
     fit = followed(best.fit, larger, values, MOST_STEPS, ceiling)
     with suppress(EstimationError):

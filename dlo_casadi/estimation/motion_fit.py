@@ -28,11 +28,12 @@ from dlo_casadi.estimation.motion_start import (
     tried,
     unknowns_in_motion,
 )
+from dlo_casadi.estimation.motion_told import Told, repeated, rows_of, summed
 from dlo_casadi.estimation.problem import Problem
 from dlo_casadi.estimation.recording import Recording
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Unknowns, Values
-from dlo_casadi.model.cable_model import BENDING_STIFFNESS, DAMPING_TIME, CableModel
+from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.runtime.work import accounted_as, spend
 from dlo_casadi.sensing.measured_motion import MeasuredMotion
 
@@ -49,17 +50,11 @@ _ITERATIONS, _TRIALS = 15, 8
 # First and least damping, relative to the diagonals: undamped, amplitudes of high modes that few
 # points show step out of the reach of the linearisation.
 _FIRST, _LEAST = 1e-3, 1e-4
-# How far parameters of motions repeat those of still poses, relative. Two independent discrete rods
-# with the same parameters, of 40 elements, differ by 0.1 % in frequency: 0.5 % in EI where weight
-# holds the cable, too. Without it motions claim EI to 0.02 %.
-REPEATED = {BENDING_STIFFNESS: 5e-3, DAMPING_TIME: 1.5e-2}
 # How far a point of a moving cable is predicted wrongly by mesh and steps of time, in lengths: the
 # std of photographs that are drawn without any fault is 4 um, that of their frames in motion 22 um.
 MESH_ERROR = 1e-4
 # Ratio of the noise from frame to frame to that of still poses from which on it counts.
 _NOISIER = 1.2
-# Share of the largest eigenvalue of the scaled Hessian below which motions tell nothing.
-_SHOWN = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,97 +259,19 @@ def _descended(now: MotionFit, unknowns: Unknowns, *, last: bool) -> MotionFit:
     return now
 
 
-@dataclass(frozen=True)
-class _Told:
-    """What a motion tells of theta, its own unknowns eliminated: H, g, and how these follow."""
-
-    hessian: FloatArray
-    gradient: FloatArray
-    block: FloatArray
-    cross: FloatArray
-    slope: FloatArray
-
-    @classmethod
-    def of(cls, item: FittedMotion, unknowns: Unknowns, std: float, damping: float = 0.0) -> _Told:
-        prior = 1 / item.recording.own_std(unknowns.model) ** 2
-        a, b, e = (x / std for x in (item.seen.by_theta, item.seen.by_own, item.seen.residual))
-        block, cross = b.T @ b + np.diag(prior), b.T @ a
-        block += damping * np.diag(np.diag(block))
-        slope = b.T @ e + prior * item.own
-        solved = np.linalg.solve(block, np.column_stack([cross, slope]))
-        hessian, gradient = a.T @ a - cross.T @ solved[:, :-1], a.T @ e - cross.T @ solved[:, -1]
-        return cls(hessian, gradient, block, cross, slope)
-
-    def own_step(self, step: FloatArray) -> FloatArray:
-        """Change of its own unknowns with a step of theta."""
-        return -np.linalg.solve(self.block, self.cross @ step + self.slope)
-
-
-_SUMMED = ("hessian", "gradient")
-
-
 def told_by(now: MotionFit) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Hessian (size, size) and gradient (size,) of the motions, and the gradient's variance.
 
     Their own unknowns are eliminated.
     """
-    unknowns = unknowns_in_motion(now.fit.problem.unknowns)
-    told = [_Told.of(item, unknowns, now.std) for item in now.motions]
-    pairs = zip(now.motions, told, strict=True)
-    varied = sum(_varied(item, one, now.std) for item, one in pairs)
-    hessian, gradient = (np.sum([getattr(x, key) for x in told], axis=0) for key in _SUMMED)
-    return hessian, gradient, np.asarray(varied)
-
-
-def _rows(
-    told: Sequence[_Told],
-    theta: FloatArray,
-    damping: float,
-    varied: FloatArray | None = None,
-    repeated: FloatArray | None = None,
-) -> tuple[tuple[FloatArray, float], ...]:
-    """Rows of `Priors.told` whose square is that of the motions, linearised at theta.
-
-    `varied`: variance of the gradient, where it is larger than the Hessian; see `_varied`.
-    `repeated` (size,): standard deviations of theta from the still poses to the motions.
-    """
-    hessian = sum((x.hessian for x in told), np.zeros((len(theta), len(theta))))
-    gradient = sum((x.gradient for x in told), np.zeros(len(theta)))
-    scale = np.sqrt(np.maximum(np.diag(hessian), 1e-12))
-    scaled = hessian / np.outer(scale, scale) + damping * np.eye(len(theta))
-    values, vectors = np.linalg.eigh(scaled)
-    kept = values > _SHOWN * values[-1]
-    roots, vectors = np.sqrt(values[kept]), vectors[:, kept]
-    rows = (roots[:, None] * vectors.T) * scale
-    pulled = (vectors.T @ (gradient / scale)) / roots
-    if varied is not None:
-        arm = (vectors.T / scale) / roots[:, None]
-        sizes, axes = np.linalg.eigh(arm @ varied @ arm.T)
-        share = axes.T / np.sqrt(np.maximum(sizes, 1.0))[:, None]
-        rows, pulled = share @ rows, share @ pulled
-    if repeated is not None:
-        loose = rows * repeated
-        sizes, axes = np.linalg.eigh(np.eye(len(rows)) + loose @ loose.T)
-        share = axes.T / np.sqrt(sizes)[:, None]
-        rows, pulled = share @ rows, share @ pulled
-    return tuple((row, float(row @ theta - pull)) for row, pull in zip(rows, pulled, strict=True))
-
-
-def _repeated(unknowns: Unknowns, theta: FloatArray) -> FloatArray:
-    """Standard deviations (size,) of theta from the still poses to the motions."""
-    out, names = np.zeros(len(theta)), unknowns.names
-    for name, std in REPEATED.items():
-        if name in names:
-            k = names.index(name)
-            out[k] = std if name == BENDING_STIFFNESS else std * abs(theta[k])
-    return out
+    return summed(now.motions, unknowns_in_motion(now.fit.problem.unknowns), now.std)
 
 
 def _stepped(now: MotionFit, unknowns: Unknowns, damping: float) -> MotionFit | None:
     """All unknowns after one step; None if some motion is lost there."""
     theta = now.fit.point.theta
-    told = [_Told.of(item, unknowns, now.std, damping) for item in now.motions]
-    priors = replace(now.still.priors, told=_rows(told, theta, damping))
+    told = [Told.of(item, unknowns, now.std, damping) for item in now.motions]
+    priors = replace(now.still.priors, told=rows_of(told, theta, damping))
     problem = replace(now.fit.problem, priors=priors)
     descended = descend(Fit(problem, problem.evaluate(now.fit.point)))
     step = descended.point.theta - theta
@@ -373,11 +290,8 @@ def _told_to(now: MotionFit, unknowns: Unknowns) -> MotionFit:
     The minimum stays that of the whole objective: rows and values of `Priors.told` balance the
     gradient of the still poses there.
     """
-    told = [_Told.of(item, unknowns, now.std) for item in now.motions]
-    _, _, varied = told_by(now)
     theta, point = now.fit.point.theta, now.fit.point
-    loose = _rows(told, theta, 0.0, varied, _repeated(unknowns, theta))
-    rows = np.array([row for row, _ in loose])
+    rows = np.array([row for row, _ in _loose_rows(now, unknowns)])
     still = Fit(now.still, now.still.evaluate(point)).normal.gradient
     pulled = np.linalg.lstsq(rows.T, -still, rcond=None)[0]
     balanced = tuple(
@@ -388,6 +302,13 @@ def _told_to(now: MotionFit, unknowns: Unknowns) -> MotionFit:
     return replace(now, fit=fit)
 
 
+def _loose_rows(now: MotionFit, unknowns: Unknowns) -> tuple[tuple[FloatArray, float], ...]:
+    """What the motions tell, no more than they repeat the still poses, see `motion_told`."""
+    told = [Told.of(item, unknowns, now.std) for item in now.motions]
+    theta = now.fit.point.theta
+    return rows_of(told, theta, 0.0, told_by(now)[2], repeated(unknowns, theta))
+
+
 def repeated_fit(now: MotionFit) -> Fit:
     """The still poses with what the motions tell of them.
 
@@ -395,40 +316,9 @@ def repeated_fit(now: MotionFit) -> Fit:
     over both is that of the motions, which are many; this one is between theirs and the poses' own.
     """
     unknowns = unknowns_in_motion(now.fit.problem.unknowns)
-    told = [_Told.of(item, unknowns, now.std) for item in now.motions]
-    theta = now.fit.point.theta
-    rows = _rows(told, theta, 0.0, told_by(now)[2], _repeated(unknowns, theta))
+    rows = _loose_rows(now, unknowns)
     problem = replace(now.fit.problem, priors=replace(now.still.priors, told=rows))
     return descend(Fit(problem, problem.evaluate(now.fit.point)))
-
-
-def _varied(item: FittedMotion, told: _Told, std: float) -> FloatArray:
-    """Variance (size, size) of the gradient by theta, from the residuals themselves.
-
-        J = sum_t s_t s_t' + sum_(l <= L) (1 - l / (L + 1)) sum_t (s_t s_(t+l)' + s_(t+l) s_t')
-
-    s_t: the part of the gradient from time t. White noise gives the Hessian; what the model lacks
-    lasts for a while and along the cable, and its parts add up. L is half a period of the first
-    mode.
-
-    References
-    ----------
-    Newey and West, Econometrica 55 (1987).
-    """
-    seen, times = item.seen, item.recording.times
-    own = np.linalg.solve(told.block, told.cross)
-    rows = (seen.by_theta - seen.by_own @ own) * (seen.residual / std**2)[:, None]
-    mask = np.isfinite(item.recording.measured.points[: len(times), :, 0])
-    dimension = len(rows) // int(mask.sum())
-    at = np.repeat(np.repeat(np.arange(len(times)), mask.sum(axis=1)), dimension)
-    scores = np.zeros((len(times), rows.shape[1]))
-    np.add.at(scores, at, rows)
-    lag = int(np.ceil(item.recording.period / 2 / np.median(np.diff(times))))
-    total = scores.T @ scores
-    for k in range(1, min(lag, len(times) - 1) + 1):
-        both = scores[:-k].T @ scores[k:]
-        total += (1 - k / (lag + 1)) * (both + both.T)
-    return total
 
 
 def predicted(now: MotionFit, measured: MeasuredMotion) -> FloatArray:

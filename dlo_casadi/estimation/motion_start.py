@@ -15,7 +15,7 @@ from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.tolerances import Tolerances
-from dlo_casadi.motion.beginning import Basis, near_shape
+from dlo_casadi.motion.beginning import Basis
 from dlo_casadi.motion.state import State
 from dlo_casadi.motion.system import MovingCable
 from dlo_casadi.runtime.work import spend
@@ -69,12 +69,9 @@ def begin(recording: Recording, fit: Fit, unknowns: Unknowns, std: float) -> Fit
     recording = replace(recording, dt=dt, period=period, rest=rest)
     ends = [*FIRST_STRETCHES[1:]]
     if not measured.at_rest:
-        recording, ends = replace(recording, basis=basis), [*FIRST_STRETCHES]
-        stds = recording.own_std(model)
-        own = np.zeros(len(stds))
-        x = _frames(recording, fit, unknowns)
-        near, eta = near_shape(cable, fixtures, rest, basis, x, stds[-2 * MODES : -MODES])
-        own[-2 * MODES : -MODES] = eta
+        basis = basis.near(cable, _frames(recording, fit, unknowns), fixtures)
+        recording, near, ends = replace(recording, basis=basis), basis.about, [*FIRST_STRETCHES]
+        own = np.zeros(len(recording.own_std(model)))
     found = None
     for end in ends:
         found = settled(replace(recording, until=end), unknowns, theta, own, near, std)

@@ -28,7 +28,7 @@ class HeldFixtures:
     """Where fixtures are, with their deviations."""
 
     def __init__(self, path: FixturePath, ways: Ways, cable: MovingCable, own: FloatArray) -> None:
-        self.cable, self._path, self._delay = cable, path, _delay(cable)
+        self.cable, self.own, self._path, self._delay = cable, own, path, _delay(cable)
         place, turns = ways
         self._place, self._turns = place @ own, turns @ own
         self._resting: Fixtures | None = None

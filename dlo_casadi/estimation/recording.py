@@ -243,7 +243,8 @@ class Recording:
         cable, at_first, given = held.cable, numbers.at(0.0), held.at(0.0)
         if self.basis is None:
             return sensitivities.at_rest(Tangent(cable, first, given), at_first)
-        return columns_of(cable, first, given, self.basis, at_first)
+        own = held.own[-2 * self.basis.forces.shape[1] :]
+        return columns_of(cable, first, given, self.basis, at_first, own)
 
     def _started(
         self,

@@ -145,6 +145,10 @@ def _added(outcome: Outcome) -> Iterator[Values]:
         }
         if rivals := " or ".join(effect.indistinguishable_from):
             yield {"line": f"These data cannot tell it from {rivals}."}
+        for name, (still, moving) in effect.told_apart.items():
+            if name not in effect.indistinguishable_from:
+                said = f"{still:.1f} without the motions, {moving:.0f} with them"
+                yield {"line": f"It is told from {name}: log evidence {said}."}
 
 
 def _wider(one: Ends, other: Ends) -> bool:

@@ -1,12 +1,15 @@
 """Effects that a diagnosis has added, with their values in its last fit."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 from dlo_casadi.cable.estimate import Estimate
 from dlo_casadi.diagnosis.diagnose import Diagnosis
+from dlo_casadi.diagnosis.told_apart import Hypothesis
 from dlo_casadi.effects import Effect
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.thresholds import EVIDENCE_APART
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,9 @@ class FoundEffect:
         Without and with the effect; None where a left-out pose is not predicted.
     indistinguishable_from : tuple of str
         Other effects that fit these data equally well.
+    told_apart : dict of (float, float)
+        By the names of rivals among the still shapes: log evidence by which this effect is ahead of
+        them without and with the recordings of the moving cable.
     """
 
     name: str
@@ -37,6 +43,7 @@ class FoundEffect:
     rmse_cross_validated_before: float | None
     rmse_cross_validated_after: float | None
     indistinguishable_from: tuple[str, ...]
+    told_apart: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     def __str__(self) -> str:
         return f"{self.label} of {self.of}" if self.of else self.label
@@ -59,6 +66,23 @@ def found_effects(diagnosis: Diagnosis) -> tuple[FoundEffect, ...]:
         )
         for item in diagnosis.added
     )
+
+
+def with_motions(effect: FoundEffect, best: Hypothesis, told: Sequence[Hypothesis]) -> FoundEffect:
+    """The effect of a hypothesis in the place of one that was found, and what it is told from."""
+    name, own = best.candidate.name, best.candidate.effect
+    ahead = {
+        x.candidate.name: (best.still - x.still, best.moving - x.moving)
+        for x in told
+        if x.candidate.name != name
+    }
+    ties = [x for x, (_, moving) in ahead.items() if moving < EVIDENCE_APART]
+    others = [x for x in effect.indistinguishable_from if x not in (*ahead, name)]
+    effect = replace(effect, indistinguishable_from=(*ties, *others), told_apart=ahead)
+    if name == effect.name:
+        return effect
+    parameters = effect_parameters(best.fit, own)
+    return replace(effect, name=name, label=own.label, of=None, parameters=parameters)
 
 
 def _support(fit: Fit, effect: Effect) -> str | None:

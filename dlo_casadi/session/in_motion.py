@@ -8,13 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from dlo_casadi.arrays import Brief, FloatArray
-from dlo_casadi.diagnosis.in_motion import InMotion, search_in_motion
+from dlo_casadi.diagnosis.in_motion import AddedInMotion, InMotion, search_in_motion
+from dlo_casadi.diagnosis.told_apart import among_dead_loads
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.motion_fit import MotionFit, fit_motions, predicted, repeated_fit
 from dlo_casadi.estimation.motion_start import FIRST_STRETCHES
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.sensing.measured_motion import MeasuredMotion
-from dlo_casadi.session.found_effects import FoundEffect, effect_parameters
+from dlo_casadi.session.found_effects import FoundEffect, effect_parameters, with_motions
+from dlo_casadi.thresholds import SIGNIFICANCE
 
 
 @dataclass(frozen=True, repr=False)
@@ -103,6 +105,7 @@ def fit_moving(
     step: Callable[[str, int, int], None],
     *,
     diagnosed: bool,
+    significance: float = SIGNIFICANCE,
     damping_time: float | None = None,
 ) -> MovingResult:
     """Fit the motions of a session with its still poses, and search for what the model lacks.
@@ -119,28 +122,35 @@ def fit_moving(
     before = fit_motions(fit, motions, damping_time=damping_time, until=until)
     step("fit the motions", 1, 1)
     found = (
-        search_in_motion(before, exclude, step) if diagnosed else InMotion(before, before, (), {})
+        search_in_motion(before, exclude, step, significance)
+        if diagnosed
+        else InMotion(before, before, (), {})
     )
     fits = [found.before, found.after] if found.added else [found.after]
     both = repeated_fit(found.after)
     return MovingResult(
         both,
         tuple(_stage(one, motions) for one in fits),
-        tuple(
-            FoundEffect(
-                name=item.candidate.name,
-                label=item.candidate.effect.label,
-                of=None,
-                parameters=effect_parameters(both, item.candidate.effect),
-                p_value=None,
-                rmse_cross_validated_before=item.before,
-                rmse_cross_validated_after=item.after,
-                indistinguishable_from=item.rivals,
-            )
-            for item in found.added
-        ),
+        tuple(_found_effect(both, found.after, item) for item in found.added),
         found.scores,
     )
+
+
+def _found_effect(fit: Fit, after: MotionFit, item: AddedInMotion) -> FoundEffect:
+    """An effect that motions show, and what they tell it from."""
+    effect = FoundEffect(
+        name=item.candidate.name,
+        label=item.candidate.effect.label,
+        of=None,
+        parameters=effect_parameters(fit, item.candidate.effect),
+        p_value=item.p_value,
+        rmse_cross_validated_before=item.before,
+        rmse_cross_validated_after=item.after,
+        indistinguishable_from=item.rivals,
+    )
+    told = among_dead_loads(after, item.candidate)
+    own = [x for x in told if x.candidate is item.candidate]
+    return with_motions(effect, own[0], told) if own else effect
 
 
 def _stage(fit: MotionFit, motions: Sequence[MeasuredMotion]) -> MotionStage:

@@ -23,6 +23,7 @@ from dlo_casadi.runtime.progress import Step, nobody
 from dlo_casadi.sensing.measured_motion import MeasuredMotion
 from dlo_casadi.session.moving_lines import (
     Place,
+    check_gaps,
     check_lines,
     marks_of_lines,
     read_video,
@@ -86,6 +87,8 @@ def read_motion(config: Config, motion: Motion, most: int | None = None) -> Meas
         points, across = marks_of_lines(points, place, config.cable.length)
         if note:
             points, note = without_jumps(points, config.cable.length, note)
+            if most is None:
+                check_gaps(points, note)
         else:
             check_lines(points, config.cable.length)
     origin = points.t[0]

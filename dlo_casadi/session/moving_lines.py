@@ -15,14 +15,13 @@ from dlo_casadi import vision
 from dlo_casadi.arrays import FloatArray, chord_lengths
 from dlo_casadi.config import Config
 from dlo_casadi.errors import MeasurementError, counted
-from dlo_casadi.io.motions import MotionPoints, first_jump
+from dlo_casadi.io.motions import GAP, MotionPoints, first_jump
 from dlo_casadi.session.measure import THREADS, view_of
 
 # From a side and times (T,) to the places (T, d) of its fixture; None if it holds no place.
 Place = Callable[[str, FloatArray], FloatArray | None]
 
-# Marks on a line, and means of neighbouring points through which it is interpolated: a mean over
-# 1/40 of a cable that is curved by 3 / L lies 3e-5 L inside of it.
+# Marks on a line, and means of neighbouring points through which it is interpolated.
 MARKS, _MEANS = 20, 40
 # Fewest points of a line.
 _LEAST = 5
@@ -82,11 +81,18 @@ def _marks(
     end: FloatArray | None,
 ) -> tuple[FloatArray, FloatArray]:
     """Points and tangents (MARKS, d) of a line (K, d); NaN where it was not seen."""
-    means = [part.mean(axis=0) for part in np.array_split(line, min(len(line), _MEANS))]
+    count = min(len(line), _MEANS)
+    means = [part.mean(axis=0) for part in np.array_split(line, count)]
+    spread = np.array([x.var() for x in np.array_split(chord_lengths(line), count)])
+    spread = np.minimum(spread, _GAP**2 * np.median(spread))
     ends = [[] if x is None else [x] for x in (start, end)]
     knots = np.array([*ends[0], *means, *ends[1]])
     u = chord_lengths(knots)
     knots, u = knots[np.append(True, np.diff(u) > 0)], np.unique(u)
+    # The mean of an arc lies inside of it, by half its variance along the line times its curvature:
+    # for a fortieth of a cable that is curved by 3 / L, by 8e-5 L.
+    averaged = slice(len(ends[0]), len(ends[0]) + count)
+    knots[averaged] -= spread[:, None] / 2 * CubicSpline(u, knots)(u[averaged], 2)
     curve = CubicSpline(u, knots)
     fine = np.linspace(0.0, u[-1], 8 * len(u))
     along = chord_lengths(curve(fine))
@@ -181,6 +187,19 @@ def read_video(
     if left := [f"{n} {what}" for n, what in ((len(lost), "lost"), (blurred, "blurred")) if n]:
         note += f", {' and '.join(left)} left out"
     return marks, note
+
+
+def check_gaps(marks: MotionPoints, note: str) -> None:
+    """Refuse a video that does not show the cable for too long; `note`: what was left out."""
+    seen = marks.t[np.isfinite(marks.points[..., 0]).any(axis=1)]
+    gaps = np.diff(seen)
+    if len(gaps) and gaps.max() > GAP:
+        k = int(gaps.argmax())
+        raise MeasurementError(
+            f"no frame from {seen[k]:.2f} to {seen[k + 1]:.2f} s could be used, a gap of "
+            f"{gaps[k]:.2g} s (at most {GAP:g}); {note}.\n"
+            f"  Try: two motions, one video until {seen[k]:.2f} s and one from {seen[k + 1]:.2f} s"
+        )
 
 
 def _rows(places: FloatArray | None, count: int) -> list[tuple[float, ...] | None]:

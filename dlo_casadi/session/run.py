@@ -14,6 +14,8 @@ from dlo_casadi.diagnosis.from_data import from_data
 from dlo_casadi.diagnosis.from_pose_to_pose import at_random, with_loose_poses
 from dlo_casadi.diagnosis.if_hidden import IfHidden
 from dlo_casadi.diagnosis.next_measurement import separating_pose
+from dlo_casadi.diagnosis.selection import AddedEffect
+from dlo_casadi.diagnosis.told_apart import among_rivals
 from dlo_casadi.errors import DloError, EstimationError
 from dlo_casadi.estimation.constrained import as_measured, profile_intervals, profiled
 from dlo_casadi.estimation.fit import SEARCH_MESH, fine_enough, mesh_error, refine_mesh
@@ -31,7 +33,7 @@ from dlo_casadi.sensing.measured_motion import MeasuredMotion
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session import fitting, remarks
 from dlo_casadi.session.fit_remarks import fit_warnings
-from dlo_casadi.session.found_effects import found_effects
+from dlo_casadi.session.found_effects import found_effects, with_motions
 from dlo_casadi.session.in_motion import fit_moving
 from dlo_casadi.session.measure import calibrated, measured_poses, read_inputs
 from dlo_casadi.session.motions import read_motions
@@ -155,12 +157,14 @@ class _Run:
         stages = [*stages, own]
         step("compare with simpler fits", 1, 1)
         if diagnosed:
-            fit, found = self.close_the_loop(fit, nearest, stages, measured, reported, center)
+            fit, found, added = self.close_the_loop(
+                fit, nearest, stages, measured, reported, center
+            )
         else:
-            fit, found = nearest, {}
+            fit, found, added = nearest, {}, ()
         if self.motions:
             try:
-                fit, found = self.moved(fit, found, stages, measured, reported)
+                fit, found = self.moved(fit, found, added, stages, measured, reported)
             except EstimationError as error:
                 # What the still poses tell stands without them.
                 warnings.append(f"recorded motions could not be fitted: {error.message}")
@@ -191,10 +195,10 @@ class _Run:
         measured: Sequence[MeasuredPose],
         reported: Sequence[str],
         center: tuple[float, float] | None,
-    ) -> tuple[Fit, dict[str, Any]]:
+    ) -> tuple[Fit, dict[str, Any], tuple[AddedEffect, ...]]:
         """Diagnose the declared model's residual and add missing effects.
 
-        Returns the last fit, and the diagnosis in the fields of an `Outcome`.
+        Returns the last fit, the diagnosis in the fields of an `Outcome`, and what was added.
 
         `nearest`: the declared fit, or a fit with the misfit as noise where that comes nearer to
         the poses; it is reported unless effects are found, or nothing is missing. The last of the
@@ -261,31 +265,39 @@ class _Run:
             "if_hidden": diagnosis.if_hidden,
             "cut_off": diagnosis.cut_off,
         }
-        return fit, found
+        return fit, found, diagnosis.added
 
     def moved(
         self,
         fit: Fit,
         found: dict[str, Any],
+        added: Sequence[AddedEffect],
         stages: list[Stage],
         measured: Sequence[MeasuredPose],
         reported: Sequence[str],
     ) -> tuple[Fit, dict[str, Any]]:
         """Fit the motions with the still poses; the last stage becomes that of both.
 
-        Another stage follows if effects are found that only motion shows.
+        Of effects `added` that still shapes leave tied the motions choose. Another stage follows if
+        effects are found that only motion shows.
         """
         began, options = time.perf_counter(), self.config.diagnosis
+        effects = list(found.get("effects", ()))
+        for k, item in enumerate(added):
+            told = among_rivals(fit, item, self.motions, self.config.cable.damping_time)
+            if told:
+                fit, effects[k] = told[0].fit, with_motions(effects[k], told[0], told)
         result = fit_moving(
             fit,
             self.motions,
             options.exclude,
             self.step,
             diagnosed=options.enabled,
+            significance=options.significance,
             damping_time=self.config.cable.damping_time,
         )
         self.seconds["motion"] = time.perf_counter() - began
-        effects = (*found.get("effects", ()), *result.effects)
+        effects = [*effects, *result.effects]
         names = [*reported, *_parameters_of({x.label for x in effects}, result.fit.model)]
         last = stages[-1]
         own = fit_stage(last.name, result.fit, measured, profile_intervals(result.fit), names)
@@ -295,7 +307,7 @@ class _Run:
             stages.append(replace(own, name="closed", motion=others[-1], explains=last.explains))
         else:
             stages[-1] = replace(own, motion=first, explains=last.explains)
-        more: dict[str, Any] = {"effects": effects, "motion_scores": result.scores}
+        more: dict[str, Any] = {"effects": tuple(effects), "motion_scores": result.scores}
         if result.effects and found.get("verdict") == "complete":
             more["verdict"] = "effect_found"
         return result.fit, {**found, **more}

@@ -7,6 +7,7 @@ import pytest
 
 from dlo_casadi.diagnosis.in_motion import search_in_motion
 from dlo_casadi.effects import AirDrag, CableData
+from dlo_casadi.effects.stiffness import DynamicStiffness
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
@@ -47,12 +48,13 @@ def still(k: int, heading: float) -> MeasuredPose:
     return MeasuredPose.of_points(pose, points, s=S)
 
 
-def motion(name: str, k: int, *, drag: float = 0.0, held_out: bool = False) -> MeasuredMotion:
+def motion(
+    name: str, k: int, *, drag: float = 0.0, stiffer: float = 1.0, held_out: bool = False
+) -> MeasuredMotion:
     """Markers of a cable whose clamp is carried aside in a third of a second."""
-    model = model_of(TRUE, 16, (AirDrag(),) if drag else ())
-    p = np.array(
-        [drag if "air" in name else x for name, x in zip(model.names, model.nominal, strict=True)]
-    )
+    model = model_of(TRUE, 16, (AirDrag(), DynamicStiffness()))
+    known = {"air_drag.coefficient": drag, "dynamic_stiffness.factor": stiffer}
+    p = np.array([known.get(x, y) for x, y in zip(model.names, model.nominal, strict=True)])
     cable = MovingCable(model, p, np.zeros(model.chain.n_rests))
     t = np.arange(0.0, 0.7, 0.01)
     share = np.clip((t - 0.05) / 0.3, 0.0, 1.0)
@@ -61,6 +63,7 @@ def motion(name: str, k: int, *, drag: float = 0.0, held_out: bool = False) -> M
     pose = HeldPose(start=START, start_heading=-0.8)
     path = FixturePath.of(pose, t, {"start": start})
     eq = solve_equilibrium(model, p, cable.rest, pose)
+    cable = cable.about(eq.x)
     way = way_of(cable, cable.at_rest(eq, path.at(0.0, cable)), path, (0.0, float(T[-1])), 1e-6)
     points = way.points(T, S) + noise(10 + k, (len(T), len(S), 2))
     points[3, 1] = np.nan
@@ -75,9 +78,9 @@ def stills() -> list[MeasuredPose]:
     return [still(k, heading) for k, heading in enumerate((-0.2, -0.7, -1.2, 0.3))]
 
 
-def fitted(stills: list[MeasuredPose], drag: float = 0.0) -> MotionFit:
+def fitted(stills: list[MeasuredPose], **hidden: float) -> MotionFit:
     fit = fit_model(model_of(DECLARED, 20), stills, Tolerances(), STD)
-    return fit_motions(fit, [motion("carry", 0, drag=drag), motion("back", 1, drag=drag)])
+    return fit_motions(fit, [motion("carry", 0, **hidden), motion("back", 1, **hidden)])
 
 
 def test_damping_is_found_and_motions_are_predicted(stills: list[MeasuredPose]) -> None:
@@ -103,3 +106,15 @@ def test_drag_of_air_is_found(stills: list[MeasuredPose]) -> None:
         abs(drag.value("air_drag.coefficient") - 3.0) < 3 * drag.std("air_drag.coefficient") + 0.1
     )
     assert found.after.rmse < before.rmse
+
+
+def test_what_a_tolerance_hides_is_found_without_a_misfit(stills: list[MeasuredPose]) -> None:
+    before = fitted(stills, stiffer=1.13)
+    assert before.chi2_per_dof < 1.15
+    found = search_in_motion(before)
+    (effect,) = found.added
+    assert effect.candidate.name == "dynamic_stiffness"
+    assert effect.p_value < 1e-6
+    factor = found.after.fit
+    std = factor.std("dynamic_stiffness.factor")
+    assert abs(factor.value("dynamic_stiffness.factor") - 1.13) < 3 * std

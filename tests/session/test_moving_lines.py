@@ -55,7 +55,8 @@ def test_marks_lie_on_their_lines(d: int, count: int) -> None:
     off = (across @ (marks.points - true)[..., None])[..., 0]
     seen = np.isfinite(off[..., 0])
     assert seen.mean() > 0.85
-    assert np.abs(off[seen]).max() < 1e-4
+    # A mean of ten points of 150 lies 2.4e-6 m inside of its arc, unless that is corrected.
+    assert np.abs(off[seen]).max() < (1e-6 if count == 150 else 2e-5)
 
 
 def test_a_hidden_stretch_is_not_compared() -> None:
@@ -67,16 +68,16 @@ def test_a_hidden_stretch_is_not_compared() -> None:
     assert hidden.sum() >= 4
 
 
-def film(folder: Path, lost: int = 5) -> None:
-    """Twelve frames of a swing, one of them black."""
+def film(folder: Path, lost: tuple[int, ...] = (5,), rate: float = 60) -> None:
+    """Twelve frames of a swing, some of them black."""
     shape = (380, 380)
     file = str(folder / "swing.avi")
-    writer = cv2.VideoWriter(file, cv2.VideoWriter.fourcc(*"MJPG"), 60, shape[::-1])
+    writer = cv2.VideoWriter(file, cv2.VideoWriter.fourcc(*"MJPG"), rate, shape[::-1])
     s = np.linspace(0.0, LENGTH, 300)
     cv2.imwrite(str(folder / "still.png"), drawing.draw(curve(0.0, s), shape=shape))
     for k, t in enumerate(T):
         picture = drawing.draw(curve(t, s), shape=shape)
-        writer.write(0 * picture if k == lost else picture)
+        writer.write(0 * picture if k in lost else picture)
     writer.release()
 
 
@@ -96,4 +97,12 @@ def test_frames_of_a_video_are_read_as_photographs(tmp_path: Path) -> None:
         read_motions(space)
     (tmp_path / "swing.avi").write_bytes(b"RIFF....AVI ")
     with pytest.raises(dlo.MeasurementError, match="no frame that OpenCV can read"):
+        read_motions(config)
+
+
+def test_a_video_with_a_gap_is_refused(tmp_path: Path) -> None:
+    film(tmp_path, lost=(3, 4, 5, 6, 7), rate=10)
+    (tmp_path / "session.yaml").write_text(SESSION)
+    config = load_config(tmp_path / "session.yaml")
+    with pytest.raises(dlo.MeasurementError, match=r"from 0.20 to 0.80 s could be used.*5 lost"):
         read_motions(config)
