@@ -14,6 +14,8 @@ import yaml
 from rods import GRAVITY, Held, Lying, Mass, Pin, Rod
 from scipy.spatial.transform import Rotation
 
+from dlo_casadi.effects import EFFECTS
+
 FOLDER = Path(__file__).parent / "data"
 NOISE = 3e-4  # m
 TENTHS = np.linspace(0.0, 1.0, 11)
@@ -81,12 +83,14 @@ def lines(boundary, gravity=(0.0, -GRAVITY), **more):
     return {**held, "measurement": {"kind": "centerlines", "std": NOISE}, **more}
 
 
-def quick(n=12, *exclude):
-    """Options of a fit that takes seconds: few elements, few candidates."""
+def quick(n, *among):
+    """Options of a fit that takes seconds: few elements, few candidates to try."""
     options = {"model": {"n": n}, "estimation": {"algorithm1": False}}
-    return options | {"diagnosis": {"exclude": list(exclude)}}
+    return options | {"diagnosis": {"exclude": sorted({*EFFECTS} - {*among})}}
 
 
+# Candidates of every complete cable.
+COMMON = ("length_error", "lumped_mass", "rest_curvature_drift", "stiffness_gradient")
 # Of the cables in the plane [m].
 ENDS = (
     *((0.5, 0.1), (0.62, -0.05), (0.4, -0.2), (0.55, 0.25)),
@@ -100,7 +104,8 @@ def weight():
     rod = Rod(length, 0.06 * GRAVITY / length, 0.02)
     cable = {"length": length, "mass": 0.06, "diameter": 0.006, "bending_stiffness": 0.05}
     cable["rest_shape"] = "straight"
-    session = Writer("weight", 1, cable, lines(("pinned", "pinned")), quick(), count=25)
+    options = quick(12, "lumped_mass", "point_force", "gravity_tilt")
+    session = Writer("weight", 1, cable, lines(("pinned", "pinned")), options, count=25)
     for k, end in enumerate(ENDS):
         shape = rod.solve(Held((0.0, 0.0)), Held(end), [Mass(mass)], [place])
         held = {"start": [0.0, 0.0], "end": list(end)}
@@ -119,7 +124,8 @@ def tip():
     cable = {"length": length, "mass": None, "diameter": 0.005, "bending_stiffness": 0.03}
     experiment = lines(("clamped", "free"))
     experiment["measurement"] |= {"force_std": std[0], "moment_std": std[1]}
-    session = Writer("tip", 7, cable, experiment, quick(), count=12, markers=True)
+    options = quick(12, *COMMON, "gravity_tilt", "image_scale", "point_force")
+    session = Writer("tip", 7, cable, experiment, options, count=12, markers=True)
     for k, heading in enumerate((0.0, 0.8, -0.5, 1.4, 0.4)):
         shape = rod.solve(Held((0.1, 0.2), heading), None)
         held = {"start": [0.1, 0.2], "start_heading": heading}
@@ -140,7 +146,7 @@ def grippers():
     cable = {"length": length, "mass": 0.03, "diameter": 0.004, "bending_stiffness": 0.025}
     experiment = lines(("clamped", "clamped"), (0.0, 0.0, -GRAVITY))
     experiment["measurement"] |= {"force_std": std[0], "moment_std": std[1]}
-    options = quick(14, "tether", "plastic_set", "stiff_section")
+    options = quick(14, *COMMON, "bending_anisotropy", "clamp_rotation")
     session = Writer("grippers", 3, cable, experiment, options, count=10, markers=True)
     for k, roll in enumerate((-1.6, 0.0, 1.4, 0.5, -0.8, 0.9)):
         turns = session.random.uniform(-0.5, 0.5, (2, 3))
@@ -162,7 +168,7 @@ def harness():
     rod = Rod(length, 0.06 * GRAVITY / length, 0.02)
     cable = {"length": length, "mass": 0.06, "diameter": 0.006, "bending_stiffness": 0.01}
     cable["rest_shape"] = "straight"
-    options = quick(16, "lumped_mass", "tether", "plastic_set", "stiff_section")
+    options = quick(16, "clip_offset", "clip_slip", "end_offset")
     session = Writer("harness", 4, cable, lines(("pinned", "pinned")), options, count=25)
     for k, end in enumerate(((0.5, 0.1), (0.6, -0.05), (0.55, 0.0), (0.45, 0.05), (0.62, 0.1))):
         free = rod.solve(Held((0.0, 0.0)), Held(end))
@@ -187,7 +193,7 @@ def table():
     cable["rest_shape"] = "straight"
     desk = {"name": "desk", "kind": "plane", "point": [0.0, level], "normal": [0.0, 1.0]}
     experiment = lines(("clamped", "free"), obstacles=[desk])
-    options = quick(16, "tether", "plastic_set", "stiff_section", "lumped_mass")
+    options = quick(16, "obstacle_offset", "clamp_angle", "gravity_tilt")
     session = Writer("table", 5, cable, experiment, options, count=16, markers=True)
     for k, (height, heading) in enumerate(
         ((0.09, -0.3), (0.11, 0.0), (0.16, -0.9), (0.13, -0.6), (0.1, -0.2))
@@ -207,7 +213,7 @@ def fleet():
     length, s = 0.6, np.linspace(0.0, 0.6, 241)
     for name, stiffness, rate in (("soft", 0.006, {}), ("creeping", 0.01, {"rate": 0.25})):
         cable = {"length": length, "mass": 0.03, "diameter": 0.005, "bending_stiffness": 0.01}
-        options = quick(12, "tether", "stiff_section", "lumped_mass", "bending_softening")
+        options = quick(12, "plastic_set", "rest_curvature_drift", "clamp_angle", "gravity_tilt")
         experiment = lines(("clamped", "clamped"))
         session = Writer(f"fleet/{name}", 6, cable, experiment, options, count=20)
         rest = 0.5 * np.sin(np.pi * s / length)

@@ -86,6 +86,7 @@ class Story:
         assert all((self.results / name).exists() for name in WRITTEN)
         page = (self.results / "report.html").read_text()
         assert verdict.replace("_", " ") in page.lower()
+        self._check_candidates()
         assert all(effect in page for effect in self.effects)
         stiffnesses = {x: x for x in ("bending_stiffness", "torsional_stiffness")}
         for key, label in (stiffnesses | labels).items():
@@ -109,6 +110,16 @@ class Story:
         assert 0.6 * noise < self.last["rmse_fit"] < 1.2 * noise
         assert 0.5 * noise < self.last["rmse_held_out"] < held_out * noise
         assert self.report["repeatability"]["held_out_inside_90"] > 0.7
+
+    def _check_candidates(self) -> None:
+        """Every refit that is not chosen says why; some candidate is tried."""
+        found, candidates = self.report["effects"], self.report["candidates"]
+        chosen = {x for row in found for x in (row["name"], *row["indistinguishable_from"])}
+        lost = {row["name"] for row in candidates if row["reason"]}
+        refitted = {row["name"] for row in candidates if row["rmse_cross_validated"] is not None}
+        assert candidates
+        assert refitted <= chosen | lost
+        assert not chosen & lost
 
     def pose(self, name: str) -> dict:
         """What the configuration says of a pose."""
