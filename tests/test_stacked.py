@@ -1,5 +1,6 @@
 """Functions of segments over many poses: vectorised ones give the same numbers, bit for bit."""
 
+import shutil
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -8,6 +9,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from dlo_casadi.codegen.segments import compile_functions
 from dlo_casadi.effects import BendingSoftening, CableData, PointForce, StiffSection
 from dlo_casadi.model import stacked
 from dlo_casadi.model.cable_model import CableModel
@@ -53,7 +55,7 @@ def test_numbers_of_a_segment_do_not_depend_on_how_they_are_computed(
     monkeypatch.setattr(stacked, "WORTH", np.inf)
     simpler = mapped(*given)
     assert mapped._simplified
-    assert mapped._function.n_instructions() <= function.n_instructions()
+    assert mapped.function.n_instructions() <= function.n_instructions()
     monkeypatch.setattr(stacked, "FEWEST", 0)
     monkeypatch.setattr(stacked, "WORTH", 0)
     few = mapped(*(block[:2] for block in given))
@@ -83,7 +85,7 @@ def test_a_function_that_calls_another_stays_scalar(monkeypatch):
     x = ca.SX.sym("x", 2)
     called = ca.Function("called", [x], [ca.sumsqr(x)], {"never_inline": True})
     mapped = Mapped(ca.Function("f", [x], [ca.densify(2 * called(x))]))
-    (given,) = arguments(mapped._function, 3, 10)
+    (given,) = arguments(mapped.function, 3, 10)
     (found,) = mapped(given)
     assert mapped._vectorised is None
     np.testing.assert_allclose(found[..., 0, 0], 2 * (given**2).sum(axis=2))
@@ -104,3 +106,16 @@ def test_threads_take_turns():
     for one, (sines, squares) in zip(given, found, strict=True):
         np.testing.assert_allclose(sines[..., 0], np.sin(one), rtol=1e-14)
         np.testing.assert_allclose(squares[..., 0, 0], (one**2).sum(axis=2), rtol=1e-14)
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
+def test_a_compiled_function_gives_the_same_numbers() -> None:
+    x = ca.SX.sym("x", 2)
+    functions = [ca.Function("f", [x], [ca.sin(x[0]) * x, x[1] ** 3]) for _ in range(2)]
+    plain, compiled = map(Mapped, functions)
+    compile_functions([compiled])
+    assert compiled.compiled
+    given = np.random.default_rng(0).normal(size=(3, 4, 2))
+    for one, other in zip(plain(given), compiled(given), strict=True):
+        assert np.array_equal(one, other)
+    compile_functions([compiled])  # nothing is left to do

@@ -17,7 +17,7 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.tracking.known import Known
-from dlo_casadi.tracking.seen import Noise
+from dlo_casadi.tracking.measured import Noise
 from dlo_casadi.tracking.tracker import Tracker
 
 Cable = TypeVar("Cable", bound=EstimatedCable)

@@ -159,7 +159,8 @@ class Mapped:
     """
 
     def __init__(self, function: ca.Function, *, repetitive: bool = False) -> None:
-        self._function, self._evaluated, self._simplified = function, 0, False
+        self.function, self._evaluated, self._simplified = function, 0, False
+        self.compiled = False
         self._repetitive = repetitive
         self._lock = Lock()
         self._shapes = [
@@ -168,6 +169,11 @@ class Mapped:
         # By number of segments. Any, here and below: CasADi's stubs do not allow NumPy memory.
         self._buffers: dict[int, tuple[Any, Any]] = {}
         self._vectorised: tuple[Any, Any] | None = None
+
+    def use(self, compiled: ca.Function) -> None:
+        """Evaluate compiled C of the same function from now on."""
+        with self._lock:
+            self.function, self._buffers, self.compiled = compiled, {}, True
 
     def __call__(self, *arguments: FloatArray) -> list[FloatArray]:
         """Arguments (m, count, rows) -> outputs (m, count, rows, columns)."""
@@ -180,23 +186,25 @@ class Mapped:
 
     def _evaluate(self, number: int, given: Sequence[FloatArray]) -> list[FloatArray]:
         """As `_one_by_one`, in the fastest way for this number of segments."""
+        if self.compiled:
+            return self._one_by_one(given)
         self._evaluated += number
         often = self._evaluated > OFTEN
         if often and not self._simplified and (self._repetitive or not self._is_large(number)):
-            self._function, self._buffers = simplified(self._function), {}
+            self.function, self._buffers = simplified(self.function), {}
             self._simplified = True
         in_blocks = often and self._is_large(number)
         return self._in_blocks(given) if in_blocks else self._one_by_one(given)
 
     def _is_large(self, number: int) -> bool:
         """Whether calls for this number of segments are worth being `vectorised`."""
-        operations = number * self._function.n_instructions()
+        operations = number * self.function.n_instructions()
         return number >= FEWEST and operations > WORTH and self._inlined
 
     @cached_property
     def _inlined(self) -> bool:
         """Whether the function calls no others, as one of a user's effect may: not `vectorised`."""
-        return not self._function.find_functions(0)
+        return not self.function.find_functions(0)
 
     def _one_by_one(self, arguments: Sequence[FloatArray]) -> list[FloatArray]:
         """Arguments (segments, rows) -> outputs (segments, size)."""
@@ -205,7 +213,7 @@ class Mapped:
         if not number:
             return outputs
         if number not in self._buffers:
-            self._buffers[number] = self._function.map(number).buffer()
+            self._buffers[number] = self.function.map(number).buffer()
         given = [np.ascontiguousarray(x, dtype=float) for x in arguments]
         _run(self._buffers[number], given, outputs)
         return outputs
@@ -213,7 +221,7 @@ class Mapped:
     def _in_blocks(self, arguments: Sequence[FloatArray]) -> list[FloatArray]:
         """As `_one_by_one`; the last block is filled up with the last segment."""
         if self._vectorised is None:
-            self._vectorised = vectorised(self._function, BLOCK).buffer()
+            self._vectorised = vectorised(self.function, BLOCK).buffer()
         number = len(arguments[0])
         blocks = np.minimum(np.arange(-(-number // BLOCK) * BLOCK), number - 1).reshape(-1, BLOCK)
         given = [np.ascontiguousarray(x[blocks].transpose(0, 2, 1), dtype=float) for x in arguments]

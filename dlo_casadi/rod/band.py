@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg.lapack import dsytrf, dsytrs
 
 from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
 
@@ -29,6 +30,8 @@ LEAST_PIVOT = 1e-8
 # Maximum number of steps of iterative refinement, and the relative residual at which they end.
 REFINEMENTS = 3
 RESIDUAL = 1e-13
+# Relative residual beyond which a matrix is eliminated more carefully.
+_INEXACT = 1e-10
 # Conditions whose eigenvalue is below this share depend on each other: that is the rounding error.
 ZERO_PIVOT = 1e-13
 # Eigenvalues below this share of the largest entry count as zero: the elimination cannot tell them
@@ -192,17 +195,18 @@ class BandMatrix:
     def dense(self) -> FloatArray:
         """Full matrices (m, n b + k, n b + k), without internal unknowns."""
         m, n, b, k = self.border.shape
+        inner, i = np.zeros((m, n, b, n, b)), np.arange(n)
+        inner[:, i, :, i] = self.diagonal.swapaxes(0, 1)
+        inner[:, i[:-1], :, i[1:]] = self.upper.swapaxes(0, 1)
+        inner[:, i[1:], :, i[:-1]] = self.upper.mT.swapaxes(0, 1)
         full = np.zeros((m, n * b + k, n * b + k))
-        for i in range(n):
-            here, after = slice(i * b, (i + 1) * b), slice((i + 1) * b, (i + 2) * b)
-            full[:, here, here] = self.diagonal[:, i]
-            if i + 1 < n:
-                full[:, here, after] = self.upper[:, i]
-                full[:, after, here] = self.upper[:, i].mT
+        full[:, : n * b, : n * b] = inner.reshape((m, n * b, n * b))
         full[:, : n * b, n * b :] = self.columns
         full[:, n * b :, : n * b] = self.columns.mT
         full[:, n * b :, n * b :] = self.corner
         kept = full.shape[1] - self.internal
+        if not self.internal:
+            return full
         own, across = full[:, kept:, kept:], full[:, :kept, kept:]
         return full[:, :kept, :kept] - across @ np.linalg.solve(own, across.mT)
 
@@ -361,3 +365,31 @@ class BandFactor:
             singular = np.abs(values).min(axis=1) < ZERO_PIVOT
         total += (self._of_alone < 0).sum(axis=1) - self._not_counted
         return np.where(singular, -1, total)
+
+
+class DenseFactor:
+    """The elimination of one matrix as a whole: for a single pose that is faster than by levels.
+
+    Bunch and Kaufman's L D L^T, whose blocks of two have a negative and a positive eigenvalue.
+    """
+
+    def __init__(self, matrix: BandMatrix) -> None:
+        self._matrix, self._full = matrix, matrix.dense()[0]
+        self._factor, self._pivots, self._info = dsytrf(self._full, lower=1)
+
+    def solve(self, right: Vector) -> Vector:
+        """Solution for columns (1, n, b, q), (1, k, q); as `BandFactor` if it is inexact."""
+        rows = right.rows[0]
+        found, _ = dsytrs(self._factor, self._pivots, rows, lower=1)
+        left = np.abs(rows - self._full @ found).max(initial=0.0)
+        if self._info or not left <= _INEXACT * np.abs(rows).max(initial=0.0):
+            return self._matrix.factor().solve(right)
+        _, n, b, q = right.x.shape
+        return Vector(found[: n * b].reshape((1, n, b, q)), found[None, n * b :])
+
+    @property
+    def negative(self) -> int:
+        """Number of negative eigenvalues, border included."""
+        single = self._pivots > 0
+        below = (np.diag(self._factor) < 0) & single
+        return int(below.sum() + (~single).sum() // 2)

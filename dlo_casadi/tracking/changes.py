@@ -37,7 +37,8 @@ from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import STIFFNESSES, CableModel
 from dlo_casadi.thresholds import COLLINEAR, SCANS_APART
 from dlo_casadi.tracking.known import coefficient
-from dlo_casadi.tracking.seen import Seen, declared
+from dlo_casadi.tracking.seen import Seen
+from dlo_casadi.tracking.shaper import declared
 
 # Places of a new weight, of those that the diagnosis tries, that are looked at every few poses.
 _WEIGHTS = (2, 8, 14, 20)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
@@ -13,7 +12,9 @@ from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.thresholds import EVIDENCE_APART, NEAR_END
 from dlo_casadi.tracking.changes import Jump, Jumps, Probe
 from dlo_casadi.tracking.known import Known
-from dlo_casadi.tracking.seen import OUTLIER, Noise, Seen, Shaper, learned
+from dlo_casadi.tracking.measured import Noise
+from dlo_casadi.tracking.seen import OUTLIER, Seen, learned
+from dlo_casadi.tracking.shaper import Shaper
 
 # Poses after an alarm at which its cause is judged again while others explain it as well.
 JUDGED = (1, 2, 4, 8, 16, 32)
@@ -140,7 +141,8 @@ class Inquiry:
 
     def add(self, seen: Seen) -> None:
         """One more pose, as the tracker has seen it."""
-        shaper = Shaper(False, self._last)
+        last = self.poses[-1]
+        shaper = Shaper.after(last.model, last.held, last.shapes)
         after, own = learned(
             self.faded(self.cable), seen.pose, seen.held, self.noise, seen.number, shaper
         )
@@ -149,11 +151,6 @@ class Inquiry:
         self.poses.append(own)
         for jumps in self._jumps:
             jumps.add(own, jumps.probe.columns([own])[0])
-
-    @property
-    def _last(self) -> Any:
-        last = self.poses[-1]
-        return last.model, last.held, last.shapes
 
     def verdict(self, *, final: bool) -> tuple[Change, Known]:
         """What changed, and the cable after it."""
@@ -261,8 +258,9 @@ class Inquiry:
         try:
             for one in poses:
                 prior = self.faded(cable) if seen else cable
-                last = (seen[-1].model, seen[-1].held, seen[-1].shapes) if seen else None
-                shaper = Shaper(False, last)
+                shaper = Shaper()
+                if seen:
+                    shaper.keep(seen[-1].model, seen[-1].held, seen[-1].shapes)
                 cable, told = learned(prior, one.pose, one.held, self.noise, one.number, shaper)
                 assert told is not None
                 seen.append(told)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -49,6 +49,41 @@ class Known:
         new = np.where(self._logs, self.p * rise, self.p + by_p)
         p = np.where(by_p == 0, self.p, np.clip(new, bounds[:, 0], bounds[:, 1]))
         return replace(self, p=p, rest=self.rest + by_rest)
+
+    def at(self, ways: Sequence[FloatArray], step: FloatArray) -> Self:
+        """The cable after a step of its unknowns, of stiffnesses in logarithms.
+
+        `ways`: directions of parameters and rests, the unknowns first.
+        """
+        by_p, by_rest = (way[:, : len(step)] for way in ways[:2])
+        return self.moved(by_p @ (self.scale * step), by_rest @ step)
+
+    @property
+    def scale(self) -> FloatArray:
+        """Derivatives (n,) of the values by the unknowns: stiffnesses, for their logarithms."""
+        logs = {q.name for q in self.model.parameters if q.log}
+        values = dict(zip(self.model.names, self.p, strict=True))
+        return np.array([values[x] if x in logs else 1.0 for x in self.uncertainty.names])
+
+    @property
+    def root(self) -> FloatArray:
+        """A (n, n) with A A^T the covariance of the unknowns, of stiffnesses of logarithms."""
+        return np.asarray(self.uncertainty.root / self.scale[:, None])
+
+    def with_root(self, root: FloatArray) -> Self:
+        """The cable with the covariance A A^T of its unknowns, of stiffnesses of logarithms."""
+        own = self.scale[:, None] * root
+        return self.with_covariance(own @ own.T)
+
+    def apart(self, other: Known) -> FloatArray:
+        """Unknowns (n,) minus those of another cable, of stiffnesses the ratio's logarithm."""
+        model, names = self.model, self.uncertainty.names
+        rise = np.where(self._logs, np.log(self.rises(self.p, other.p)), self.p - other.p)
+        values = dict(zip(model.names, rise, strict=True))
+        if any(name not in values for name in names):
+            change = np.linalg.lstsq(model.rest_basis, self.rest - other.rest, rcond=None)[0]
+            values |= {f"rest_curvature[{k}]": x for k, x in enumerate(change)}
+        return np.array([values[name] for name in names])
 
     @property
     def _logs(self) -> BoolArray:

@@ -1,14 +1,15 @@
-"""What a measured pose tells of a cable: residuals in units of the noise, and their derivatives.
+"""A cable learns from one pose after the other.
 
 The unknowns theta = theta_0 + A z with z ~ N(0, I), A A^T = P, are those of the fit. A pose tells
 y = c(theta) + B w + e in units of its noise e ~ N(0, I), with w ~ N(0, I) for what differs from
-pose to pose (fixtures, scatter, see `Repeats`). With H = dc/dtheta A and the innovation r,
+pose to pose (fixtures, scatter, see `Repeats`). With H = dc/dtheta A, the residual r at z, and
+N = B B^T + I,
 
-    S = H H^T + B B^T + I,   K = H^T S^-1,   z = K (r + H z),   P = A (I - K H) A^T
+    P = A (I + H^T N^-1 H)^-1 A^T,   z = (I + H^T N^-1 H)^-1 H^T N^-1 (r + H z)
 
 linearised anew at each z until it stays, with steps halved that lead uphill: the iterated Kalman
-filter, for poses that change nothing
-equal to the batch fit to first order.
+filter. For poses that change nothing it equals the batch fit to first order; `smoothed` makes up
+for the rest.
 
 References
 ----------
@@ -17,167 +18,69 @@ Bell and Cathey, IEEE Trans. Autom. Control 38 (1993).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.linalg import solve_triangular
 from scipy.special import chdtrc
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.codegen import CompiledShape, CompiledSolver
 from dlo_casadi.config import Pose
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
-from dlo_casadi.equilibrium.curve import Observed, ObservedChange
 from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.equilibrium.solve import MOST_MOVED, MOST_TURNED, solve_equilibrium
-from dlo_casadi.errors import DloError
+from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.rod.band import Vector
-from dlo_casadi.rod.ends import reaction_rows
-from dlo_casadi.rod.quantities import quantity_of
-from dlo_casadi.sensing.noise import correlation
 from dlo_casadi.tracking.known import Known
+from dlo_casadi.tracking.measured import Measured, Noise
+from dlo_casadi.tracking.shaper import Linear, Shaper
 
 # Relinearisations of an update, and the step at which they end, in standard deviations after it: a
 # smaller one is as good as linear.
 _ITERATIONS, _SMALL = 15, 0.1
-# Share of the noise of a line that is correlated, if any is; the rest keeps close points apart.
-_SHARE = 0.99
-# Largest last step [rad] of Newton's method: a thousandth of what any camera sees.
-_EXACT = 1e-7
+# Error of a linear prediction, in standard deviations of the noise, that is too small to matter.
+_LINEAR = 0.005
 # Probability of a pose by chance below which it is refused.
 OUTLIER = 1e-5
 
 
-@dataclass(frozen=True)
-class Noise:
-    """Standard deviations of what is measured.
-
-    Parameters
-    ----------
-    point : float [m]
-        Of one coordinate of a point.
-    force, moment : float or None [N, N m]
-        Of one component of a reading; None if readings are not used.
-    along : float [m]
-        Distance along a line at which errors of its points are correlated by 1/e; 0 if they are
-        independent. Markers are.
-    """
-
-    point: float
-    force: float | None = None
-    moment: float | None = None
-    along: float = 0.0
-
-
 @dataclass(frozen=True, eq=False)
-class Measured:
-    """What was measured in a pose, at known places of the cable.
+class Told:
+    """What a pose tells of the unknowns, linearised: e = G (theta - theta_0) + N(0, I).
 
     Parameters
     ----------
-    points : (K, d) [m]
-    s : (K,) [m]
-        Their places along the cable.
-    marked : bool
-        Whether these were measured, too; else only distances across the cable count.
-    readings, rows, std : (r,)
-        Components of forces and moments, their rows in `Observed.readings`, and their noise.
-    noise : Noise
-    mixed : (K, K) or None
-        L of the correlations L L^T of errors along a line.
+    at : Known
+        The cable at theta_0; stiffnesses count in logarithms.
+    residual : (R,)
+    columns : (R, n)
+    turns : (k, n) [rad]
+        Derivatives of the nodes.
+    shapes : Shapes
     """
 
-    points: FloatArray
-    s: FloatArray
-    marked: bool
-    readings: FloatArray
-    rows: list[int]
-    std: FloatArray
-    noise: Noise
-    mixed: FloatArray | None = None
+    at: Known
+    residual: FloatArray
+    columns: FloatArray
+    turns: FloatArray
+    shapes: Shapes
 
-    @classmethod
-    def of(cls, pose: Pose, model: CableModel, noise: Noise) -> Measured:
-        """Measurements of a pose; points without arc lengths have no places yet."""
-        d = model.node.dimension
-        points = np.zeros((0, d)) if pose.points is None else np.asarray(pose.points, dtype=float)
-        if points.shape[1] != d:
-            raise DloError(f"points: ({d},) each belongs here, found {points.shape[1]} coordinates")
-        known = reaction_rows(model.node, len(model.clips))
-        values: list[float] = []
-        rows: list[int] = []
-        std: list[float] = []
-        for name, found in pose.readings.items():
-            size = getattr(noise, quantity_of(name).name)
-            if size is None:
-                continue
-            values += [float(x) for x in np.atleast_1d(found)]
-            rows += range(known[name].start, known[name].stop)
-            std += [size] * (known[name].stop - known[name].start)
-        if len(values) != len(rows):
-            raise DloError(f"readings: {len(rows)} components belong here, found {len(values)}")
-        s = np.zeros(len(points)) if pose.at is None else np.asarray(pose.at, dtype=float)
-        readings = np.array(values), rows, np.array(std)
-        return cls(points, s, pose.at is not None, *readings, noise)
+    def error(self, step: FloatArray) -> float:
+        """Second-order change of what is predicted, in units of the noise, roughly.
 
-    @property
-    def size(self) -> int:
-        """Number of measured numbers."""
-        points, d = self.points.shape
-        return points * (d if self.marked else d - 1) + len(self.rows)
+        It is the first-order one times how far nodes turn or stiffnesses change.
+        """
+        logs = np.array([q.log for q in self.at.model.parameters])
+        stiff = {n for n, log in zip(self.at.model.names, logs, strict=True) if log}
+        rise = [abs(x) for n, x in zip(self.at.uncertainty.names, step, strict=True) if n in stiff]
+        share = max([*rise, float(np.abs(self.turns @ step).max())])
+        return float(share * np.linalg.norm(self.columns @ step)) / 2
 
-    def on(self, seen: Observed) -> Measured:
-        """The same with the places of its points on a curve, if they are not known."""
-        if self.marked or not len(self.points):
-            return self
-        s, mixed = seen.curve.nearest(self.points), self.mixed
-        if mixed is None and self.noise.along:
-            apart = np.abs(s[:, None] - s) / self.noise.along
-            alike = _SHARE * correlation("exponential", apart) + (1 - _SHARE) * np.eye(len(s))
-            mixed = np.linalg.cholesky(alike)
-        return replace(self, s=s, mixed=mixed)
-
-    def _across(self, seen: Observed, moved: FloatArray) -> FloatArray:
-        """Displacements (K, d, q), or of a line those across it (K, d - 1, q)."""
-        if self.marked or not len(self.points):
-            return moved
-        return np.asarray(np.einsum("knd,kdq->knq", seen.curve.normals(self.s), moved))
-
-    def _rows(self, seen: Observed, moved: FloatArray) -> FloatArray:
-        """Displacements (K, d, q) as rows (., q) with independent errors of one."""
-        rows = self._across(seen, moved) / self.noise.point
-        if self.mixed is not None:
-            flat = rows.reshape(len(rows), -1)
-            rows = solve_triangular(self.mixed, flat, lower=True).reshape(rows.shape)
-        return np.asarray(rows.reshape(-1, moved.shape[2]))
-
-    def rms(self, seen: Observed) -> float:
-        """Root mean square [m] of a coordinate's distance from its prediction."""
-        gap = (self.points - seen.curve.at(self.s))[..., None]
-        return float(np.sqrt(np.square(self._across(seen, gap)).mean())) if gap.size else 0.0
-
-    def off(self, seen: Observed) -> FloatArray:
-        """Measured minus predicted (R,), in units of the noise."""
-        gap = (self.points - seen.curve.at(self.s))[..., None]
-        felt = (self.readings - seen.readings[self.rows]) / self.std if self.rows else np.zeros(0)
-        return np.concatenate([self._rows(seen, gap)[:, 0], felt])
-
-    def along(self, seen: Observed, change: ObservedChange) -> FloatArray:
-        """Derivatives (R, q) of what is predicted, in units of the noise."""
-        rows = self._rows(seen, seen.curve.moved(self.s, change.curve))
-        if not self.rows:
-            return rows
-        return np.vstack([rows, change.readings[self.rows] / self.std[:, None]])
-
-    def alike(self, seen: Observed, std: float) -> FloatArray:
-        """Derivatives (R, d) by shifts of all points alike, of this standard deviation [m]."""
-        d = self.points.shape[1]
-        shift = np.broadcast_to(std * np.eye(d), (len(self.points), d, d))
-        return np.vstack([self._rows(seen, shift), np.zeros((len(self.rows), d))])
+    def strays(self, now: Known) -> bool:
+        """Whether a cable is too far from where this was linearised."""
+        return self.error(now.apart(self.at)) > _LINEAR
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,11 +100,13 @@ class Seen:
         The predicted equilibrium.
     measured : Measured
     factor : (R, R)
-        L of S = L L^T.
+        L of S = H H^T + N = L L^T.
     innovation : (R,)
         Measured minus predicted, whitened by L.
     rms : float [m]
         Root of the mean square of the points' distances from where they were predicted.
+    told : Told
+        What it told where it was used.
     iterations : int
     """
 
@@ -215,6 +120,7 @@ class Seen:
     factor: FloatArray
     innovation: FloatArray
     rms: float
+    told: Told
     iterations: int = 0
 
     @cached_property
@@ -234,74 +140,6 @@ class Seen:
         return float(-(r @ r) / 2 - np.log(np.diag(self.factor)).sum())
 
 
-@dataclass(eq=False)
-class Shaper:
-    """Finds equilibria: near the last one, by compiled C, or anew.
-
-    Parameters
-    ----------
-    compiled : bool
-        Whether a cable is compiled; it is once for each number and kind of clips.
-    """
-
-    compiled: bool = False
-    last: tuple[CableModel, HeldPose, Shapes] | None = None
-    _solvers: dict[Any, tuple[CompiledSolver, CompiledShape | None]] = field(default_factory=dict)
-
-    def found(self, batch: BatchEquilibrium, cable: Known, held: HeldPose, *, anew: bool) -> Shapes:
-        """The equilibrium of a pose; not the one near the last if `anew`."""
-        p, rest, model = cable.p, cable.rest, cable.model
-        near = None if anew else self._near(model, held)
-        start = self._by_c(batch, cable, held, near) if self.compiled else near
-        if start is not None:
-            shapes, converged = batch.solve(declared(batch, start), p, rest, tolerance=_EXACT)
-            if converged.all() and batch.stable(shapes, p, rest).all():
-                return shapes
-        return declared(batch, solve_equilibrium(model, p, rest, held).shapes)
-
-    def _near(self, model: CableModel, held: HeldPose) -> Shapes | None:
-        """The last shape if the fixtures have hardly moved since."""
-        if self.last is None or self.last[0].clips != model.clips or self.last[0].n != model.n:
-            return None
-        _, before, shapes = self.last
-        same = replace(before, name=held.name, **_places(held)) == held
-        if not same:
-            return None
-        gaps, d = np.abs(held.ends - before.ends), model.node.dimension
-        turned = MOST_TURNED if d == 2 else MOST_TURNED / 2  # parts of a quaternion
-        near = (
-            gaps[: 2 * d].max() <= MOST_MOVED * model.cable.length and gaps[2 * d :].max() <= turned
-        )
-        return shapes if near else None
-
-    def _by_c(
-        self, batch: BatchEquilibrium, cable: Known, held: HeldPose, near: Shapes | None
-    ) -> Shapes | None:
-        """A shape by C, of the cable as it was when it was compiled."""
-        key = cable.model.clips
-        if key not in self._solvers:
-            self._solvers[key] = CompiledSolver(cable.model, cable.p, cable.rest), None
-        solver, before = self._solvers[key]
-        found = solver.solve(held, warm=None if near is None else before, throw=False)
-        if found.status != "ok":
-            return near
-        self._solvers[key] = solver, found
-        shapes = batch.start_shapes(found.x[None])
-        return shapes if near is None else replace(shapes, lam=near.lam)
-
-
-def _places(held: HeldPose) -> dict[str, Any]:
-    """What may differ between poses that are near each other."""
-    turned = ("start_heading", "end_heading", "start_orientation", "end_orientation")
-    return {name: getattr(held, name) for name in ("start", "end", *turned)}
-
-
-def declared(batch: BatchEquilibrium, shapes: Shapes) -> Shapes:
-    """Shapes with fixtures where they are declared, for a batch's model."""
-    still = np.zeros((len(shapes.x), len(batch.model.deviation_names)))
-    return replace(shapes, deviation=still)
-
-
 def learned(
     prior: Known, pose: Pose, held: HeldPose, noise: Noise, number: int, shaper: Shaper
 ) -> tuple[Known, Seen | None]:
@@ -313,18 +151,18 @@ def learned(
     measured = Measured.of(pose, own.model, noise)
     if not measured.size:
         return prior, None
-    after, seen = _learned(prior, own, held, pose, measured, number, shaper, anew=False)
-    if seen.refused and shaper.last is not None:
-        again = _learned(prior, own, held, pose, measured, number, shaper, anew=True)
+    after, seen = _learned(own, held, pose, measured, number, shaper, anew=False)
+    if seen.refused and shaper.knows:
+        again = _learned(own, held, pose, measured, number, shaper, anew=True)
         if again[1].probability > seen.probability:
             after, seen = again
-    if not seen.refused:
-        shaper.last = own.model, held, seen.shapes
-    return after, seen
+    if seen.refused:
+        return prior, seen
+    shaper.keep(own.model, held, seen.shapes)
+    return replace(after, model=prior.model), seen
 
 
 def _learned(
-    prior: Known,
     own: Known,
     held: HeldPose,
     pose: Pose,
@@ -334,60 +172,124 @@ def _learned(
     *,
     anew: bool,
 ) -> tuple[Known, Seen]:
-    uncertainty = prior.uncertainty
-    batch = BatchEquilibrium(
-        uncertainty.pose_scatter.within(own.model), [held], wrenches=bool(measured.rows)
-    )
-    by_p, by_rest, by_deviation = uncertainty.ways_in(own.model)
-    count = len(uncertainty.names)
-    z, seen = np.zeros(count), None
-    shapes, least, best = shaper.found(batch, own, held, anew=anew), np.inf, z
-    for iterations in range(1, _ITERATIONS + 1):
-        now = own.moved(by_p[:, :count] @ z, by_rest[:, :count] @ z)
-        if iterations > 1:
-            shapes, converged = batch.solve(shapes, now.p, now.rest, tolerance=_EXACT)
-            if not converged.all():
-                found = solve_equilibrium(own.model, now.p, now.rest, held)
-                shapes = declared(batch, found.shapes)
-        rate = own.rises(now.p, own.p)
-        along = batch.by_rest(shapes, now.p, now.rest, by_rest, rate[:, None] * by_p, by_deviation)
-        ((told, change),) = batch.observe(shapes, now.p, now.rest, along)
-        measured = measured.on(told)
-        residual, columns = measured.off(told), measured.along(told, change)
-        by_z = columns[:, :count]
-        by_own = np.hstack([columns[:, count:], measured.alike(told, uncertainty.repeat_std)])
-        noise = by_own @ by_own.T + np.eye(len(residual))
-        cost = float(z @ z + residual @ np.linalg.solve(noise, residual))
+    batch = _batch(own, held, measured)
+    root, ways = own.root, shaper.ways(own)
+    z: FloatArray = np.zeros(root.shape[1])
+    seen: Seen | None = None
+    start, least, best = shaper.start(batch, own, anew=anew), np.inf, z
+    for iterations in range(1, _ITERATIONS + 1):  # noqa: B007
+        now = own.at(ways, root @ z)
+        told, spread, linear, measured = _told(batch, now, measured, shaper, ways, start)
+        cost = float(z @ z + told.residual @ told.residual)
         if cost > least:  # the step was too long
-            z = (z + best) / 2
+            z, start = (z + best) / 2, linear.shapes
             continue
-        least, best, spread = cost, z, noise + by_z @ by_z.T
-        factor = cho_factor(spread, lower=True)
+        least, best = cost, z
+        columns = told.columns @ root
         if seen is None:
-            whole = np.tril(factor[0])
-            white = solve_triangular(whole, residual, lower=True)
-            known = (number, pose, prior, own.model, held, shapes, measured)
-            seen = Seen(*known, whole, white, measured.rms(told))
+            seen = _seen(number, pose, own, held, measured, told, spread, columns, linear)
             if seen.refused:
-                break
-        gain = cho_solve(factor, by_z).T
-        before, z = z, gain @ (residual + by_z @ z)
-        left = np.eye(count) - gain @ by_z
+                return own, seen
+        information = np.eye(len(z)) + columns.T @ columns
+        before, z = z, np.linalg.solve(information, columns.T @ (told.residual + columns @ z))
         step = z - before
-        if step @ np.linalg.solve(left, step) < _SMALL**2:
+        if step @ information @ step < _SMALL**2 or told.error(root @ step) < _LINEAR:
             break
-        ahead = along.x[..., :count] @ step, along.lam[..., :count] @ step
-        shapes = batch.moved(shapes, Vector(ahead[0][..., None], ahead[1][..., None]))
+        start = linear.ahead(batch, root @ step)
     else:
         z = best
     assert seen is not None
-    seen = replace(seen, iterations=iterations)
-    if seen.refused:
-        return prior, seen
-    rates = dict(zip(own.model.names, rate, strict=True))
-    root = (
-        np.array([rates.get(name, 1.0) for name in uncertainty.names])[:, None] * uncertainty.root
+    after = own.at(ways, root @ z)
+    left = np.linalg.inv(np.linalg.cholesky(information)).T
+    return after.with_root(root @ left), replace(seen, told=told, iterations=iterations)
+
+
+def joined(base: Known, poses: Iterable[Seen], shaper: Shaper) -> Known:
+    """The cable after poses, from what was known before them and what each of them told."""
+    root = base.root
+    information, slope = np.eye(root.shape[1]), np.zeros(root.shape[1])
+    for told in (one.told for one in poses):
+        columns = told.columns @ root
+        information += columns.T @ columns
+        slope += columns.T @ (told.residual + told.columns @ told.at.apart(base))
+    after = base.at(shaper.ways(base), root @ np.linalg.solve(information, slope))
+    return after.with_root(root @ np.linalg.inv(np.linalg.cholesky(information)).T)
+
+
+def smoothed(
+    base: Known, poses: Sequence[Seen], now: Known, shaper: Shaper
+) -> tuple[Known, list[Seen]]:
+    """The cable after poses, those linearised anew from whose place it has moved too far since.
+
+    Where a parameter is hardly known, the first poses are seen with wrong derivatives; a filter
+    would never mend that. As in incremental smoothing, a pose is linearised again only where it
+    matters (Kaess et al., Int. J. Robot. Res. 31 (2012)).
+    """
+    poses = list(poses)
+    for _ in range(_ITERATIONS):
+        far = [k for k, one in enumerate(poses) if one.told.strays(now)]
+        if not far:
+            break
+        try:
+            for k in far:
+                poses[k] = replace(poses[k], told=_again(poses[k], now, shaper))
+        except EquilibriumError:
+            break
+        now = joined(base, poses, shaper)
+    return now, poses
+
+
+def _again(seen: Seen, now: Known, shaper: Shaper) -> Told:
+    """What a pose tells, linearised at other values."""
+    own = now.between(seen.held)
+    batch = _batch(own, seen.held, seen.measured)
+    return _told(batch, own, seen.measured, shaper, shaper.ways(own), seen.told.shapes)[0]
+
+
+def _batch(own: Known, held: HeldPose, measured: Measured) -> BatchEquilibrium:
+    model = own.uncertainty.pose_scatter.within(own.model)
+    return BatchEquilibrium(model, [held], wrenches=bool(measured.rows))
+
+
+def _told(
+    batch: BatchEquilibrium,
+    now: Known,
+    measured: Measured,
+    shaper: Shaper,
+    ways: tuple[FloatArray, ...],
+    start: Shapes | None,
+) -> tuple[Told, FloatArray, Linear, Measured]:
+    """What a pose tells, L of its noise N = L L^T, and where its points are."""
+    count, scale = len(now.uncertainty.names), now.scale
+    by_p = ways[0].copy()
+    by_p[:, :count] *= scale
+    linear = shaper.found(batch, now, (by_p, *ways[1:]), start)
+    measured = measured.on(linear.told)
+    residual, columns = measured.off(linear.told), measured.along(linear.told, linear.change)
+    alike = measured.alike(linear.told, now.uncertainty.repeat_std)
+    own = np.hstack([columns[:, count:], alike])
+    spread = np.linalg.cholesky(own @ own.T + np.eye(len(residual)))
+    white = solve_triangular(
+        spread, np.column_stack([residual, columns[:, :count]]), lower=True, check_finite=False
     )
-    covariance = root @ ((left + left.T) / 2) @ root.T
-    after = prior.moved(by_p[:, :count] @ z, by_rest[:, :count] @ z)
-    return after.with_covariance(covariance), seen
+    turns = linear.along.x[0, ..., :count].reshape(-1, count)
+    return Told(now, white[:, 0], white[:, 1:], turns, linear.shapes), spread, linear, measured
+
+
+def _seen(
+    number: int,
+    pose: Pose,
+    own: Known,
+    held: HeldPose,
+    measured: Measured,
+    told: Told,
+    spread: FloatArray,
+    columns: FloatArray,
+    linear: Linear,
+) -> Seen:
+    """A pose as it was predicted; `columns` by independent unknowns."""
+    factor = np.linalg.cholesky(columns @ columns.T + np.eye(len(columns)))
+    white = solve_triangular(factor, told.residual, lower=True)
+    rms = measured.rms(linear.told)
+    known = (number, pose, own, own.model, held, linear.shapes, measured)
+    return Seen(*known, spread @ factor, white, rms, told)

@@ -26,7 +26,9 @@ from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.tracking.changes import Jumps, Probe
 from dlo_casadi.tracking.inquiry import JUDGED, Change, Inquiry
 from dlo_casadi.tracking.known import Known
-from dlo_casadi.tracking.seen import Noise, Seen, Shaper, learned
+from dlo_casadi.tracking.measured import Noise
+from dlo_casadi.tracking.seen import Seen, joined, learned, smoothed
+from dlo_casadi.tracking.shaper import Shaper
 
 # So many poses in a row that are refused are a change.
 IN_A_ROW = 3
@@ -111,6 +113,12 @@ class Tracker:
         # The poses on which the tests look back, each with what was known before it.
         self._kept: deque[tuple[dict[str, Any], Pose]] = deque()
         self._begin()
+        self._go_on_from(self._known)
+
+    def _go_on_from(self, known: Known) -> None:
+        """What is known before the next pose; what earlier ones told stays as it is."""
+        self._known = self._base = known
+        self._learned: list[Seen] = []
 
     def _begin(self) -> None:
         """Forget the last poses, but not what they told."""
@@ -158,11 +166,18 @@ class Tracker:
         prior = self._faded(self._known)
         held, number = self._held(prior.model, pose), self.count + 1
         after, seen = learned(prior, pose, held, self.noise, number, self._shaper)
+        if seen is not None and not seen.refused and self._steady:
+            learned_from = [*self._learned, seen]
+            after, self._learned = smoothed(self._base, learned_from, after, self._shaper)
         self.count, self._known = number, after
         change = None if seen is None else self._judged(seen)
         most = WINDOW + (0 if self._inquiry is None else JUDGED[-1])
         while len(self._kept) > most:
-            self._kept.popleft()
+            first = self._kept.popleft()[0]["count"] + 1
+            old = [one for one in self._learned if one.number == first]
+            if old:
+                self._base = joined(self._base, old, self._shaper)
+                self._learned = self._learned[1:]
         if seen is None:
             return Update(self.count, np.zeros(0), 0.0, 1.0, False, None, 0)
         return Update(
@@ -170,9 +185,14 @@ class Tracker:
             seen.iterations,
         )
 
+    @property
+    def _steady(self) -> bool:
+        """Whether what a pose told is true of the cable for ever."""
+        return self.forget == 1 and not self.drift
+
     def _faded(self, cable: Known) -> Known:
         """The cable before a pose: what is known has faded, and has walked."""
-        if self.forget == 1 and not self.drift:
+        if self._steady:
             return cable
         known = cable.uncertainty
         walked = np.array([self.drift.get(name, 0.0) for name in known.names])
@@ -189,9 +209,10 @@ class Tracker:
         """Plain data from which `resume` goes on: the last poses, and the cable before them."""
         first = self._kept[0][0] if self._kept else self._now()
         change = first["change"]
+        known = self._base if self._learned and self._inquiry is None else first["_known"]
         return finite(
             {
-                "parameters": self._as_cable(first["_known"]).metadata.document,
+                "parameters": self._as_cable(known).metadata.document,
                 "tests": {name: first[name] for name in ("count", *_TESTS)},
                 "change": None if change is None else asdict(change),
                 "poses": [_plain(pose) for _, pose in self._kept],
@@ -200,7 +221,8 @@ class Tracker:
 
     def resume(self, state: Mapping[str, Any], known: Known) -> None:
         """Go on from a `state` of such a tracker; `known`: the cable of its parameters."""
-        self._known, self.count = known, state["tests"]["count"]
+        self.count = state["tests"]["count"]
+        self._go_on_from(known)
         self.change = None if state["change"] is None else Change(**state["change"])
         self._kept.clear()
         self._begin()
@@ -216,6 +238,7 @@ class Tracker:
         if self._window and self._window[-1].model.clips != seen.model.clips:
             self._begin()  # earlier poses say nothing of other clips
             self._kept = deque([self._kept[-1]])
+            self._base, self._learned = self._kept[0][0]["_known"], self._learned[-1:]
         self._refused = self._refused + 1 if seen.refused else 0
         self._window.append(seen)
         if self._inquiry is not None and self._refused < IN_A_ROW:
@@ -281,7 +304,8 @@ class Tracker:
     def _concluded(self, *, final: bool) -> Change:
         inquiry = self._inquiry
         assert inquiry is not None
-        change, self._known = inquiry.verdict(final=final)
+        change, known = inquiry.verdict(final=final)
+        self._go_on_from(known)
         self.change = change
         self._begin()
         if change.decided:
