@@ -8,9 +8,9 @@ import pytest
 
 
 def test_wrong_inputs_end_in_a_message(capsys):
-    counts = script.check(count=30, seed=217, jobs=1)  # few that hold every family
+    counts = script.check(count=10, seed=217, jobs=1)  # few that hold every family
 
-    assert counts.total() == 30
+    assert counts.total() == 10
     assert {outcome for _, outcome in counts} == {"ok", "refused"}, capsys.readouterr().out
     assert {family for family, _ in counts} == set(script.SHARES)
 

@@ -53,7 +53,7 @@ CASES = [
     (2, "pinned", "pinned"),
     (2, "clamped", "clamped"),
     (3, "pinned", "pinned"),
-    (3, "clamped", "free"),
+    pytest.param((3, "clamped", "free"), marks=pytest.mark.long, id="3, clamped to free"),
     (3, "clamped", "swivel"),
 ]
 

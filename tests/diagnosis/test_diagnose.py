@@ -118,7 +118,7 @@ def test_a_force_may_stand_for_what_was_not_tried(name, effect, untried):
 def test_the_score_predicts_the_gain_of_a_refit(session):
     """For a small effect the score is the decrease of twice the objective, up to third order."""
     declared, measured = session
-    fit = fit_model(declared.model.with_mesh(20), measured, declared.tolerances, std=0.05)
+    fit = fit_model(declared.model.with_mesh(12), measured, declared.tolerances, std=0.05)
     listed = candidates(fit.model, setup_of(fit.model, n_poses=len(measured)))
     screened = {item.candidate.name: item for item in Screen(fit, listed).run(np.inf)}
     item = screened["gravity_tilt"]
@@ -130,8 +130,7 @@ def test_the_score_predicts_the_gain_of_a_refit(session):
 
 def test_leaving_a_pose_out_in_one_step_is_close_to_fitting_again(session):
     declared, measured = session
-    added = declared.model.with_mesh(20)
-    model = added.with_effect(BendingSoftening())
+    model = declared.model.with_mesh(12).with_effect(BendingSoftening())
     fit = fit_model(model, measured, declared.tolerances, std=2e-4)
     quick = cross_validate(fit)
     left = fit.problem.indices[0]

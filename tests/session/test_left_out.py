@@ -23,7 +23,7 @@ SOURCE = Path(__file__).parents[1] / "data/bench/short_clean/session.yaml"
 def session(tmp_path):
     """A copy of a session whose poses a test may change, with absolute files."""
     data = read_yaml(SOURCE)
-    data |= {"model": {"n": 20}, "estimation": {"algorithm1": False}}
+    data |= {"model": {"n": 8}, "estimation": {"algorithm1": False}}
     data["diagnosis"] = {"enabled": False}
     for pose in data["experiment"]["poses"]:
         pose["file"] = str(SOURCE.parent / pose["file"])

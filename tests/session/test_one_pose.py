@@ -62,6 +62,7 @@ def session(folder, boundary, cable, waves, ends, seed):
             "measurement": {"kind": "centerlines", "std": NOISE},
             "poses": poses,
         },
+        "model": {"n": 20},
     }
     path = folder / "session.yaml"
     for pose in poses:

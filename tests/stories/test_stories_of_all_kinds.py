@@ -50,7 +50,7 @@ def test_a_recording_becomes_a_session_that_tells_the_truth(tmp_path):
         for key in ("start", "end"):
             assert own[key] == pytest.approx(true[key], abs=1e-4)
     assert imported["cable"]["length"] == pytest.approx(0.6, abs=5e-4)
-    dlo("fit", session, "--output", story.results, "--quiet")
+    dlo("fit", session, "--output", story.results, "--jobs", 1, "--quiet")
     for name in ("bending_stiffness", "torsional_stiffness"):
         low, high = story.last["parameters"][name]["interval_95"]
         assert low < story.truth["parameters"][name] < high
@@ -98,7 +98,8 @@ def test_photographs_of_a_cable_in_front_of_a_board(tmp_path):
     for path, content in zip(files_of(tmp_path), (session, truth), strict=True):
         path.write_text(yaml.safe_dump(content))
     # It searches although the configuration does not.
-    dlo("diagnose", tmp_path / "session.yaml", "--output", tmp_path / "results", "--quiet")
+    options = ["--jobs", 1, "--quiet"]
+    dlo("diagnose", tmp_path / "session.yaml", "--output", tmp_path / "results", *options)
     story = Story(*files_of(tmp_path), tmp_path / "results")
     story.check("complete", noise=story.report["measurement"]["std"])
     assert story.report["measurement"]["std"] < NOISE  # a third of a pixel
