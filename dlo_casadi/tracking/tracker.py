@@ -38,7 +38,7 @@ BETWEEN_ALARMS = 1e4
 _AFTER = 2.0
 # Poses that are kept: a change is seen within them. Poses between two looks at what changed; a pose
 # less likely than this is looked at once.
-WINDOW, LOOK, _ODD = 30, 5, 0.01
+WINDOW, LOOK, ODD = 30, 5, 0.01
 
 
 # What the tests carry on from pose to pose.
@@ -255,17 +255,16 @@ class Tracker:
         if self._refused:
             return None  # one pose that was seen wrong is no change
         since = self._varied(seen)
-        if since is None and (seen.probability < _ODD or seen.number % LOOK == 0):
+        if since is None and (seen.probability < ODD or seen.number % LOOK == 0):
             since = self._looked()
         return since
 
     def _varied(self, seen: Seen) -> int | None:
         """Page's test of the innovations' variance."""
-        r = seen.innovation
-        gained = (r @ r) * (1 - 1 / _AFTER) - len(r) * np.log(_AFTER)
         if self._suspicion <= 0:
             self._since = seen.number
-        self._suspicion = max(0.0, self._suspicion + gained / 2)
+        r = seen.innovation
+        self._suspicion = float(page_sum(self._suspicion, r @ r, len(r)))
         return self._since if self._suspicion > np.log(2 * BETWEEN_ALARMS) else None
 
     def _looked(self) -> int | None:
@@ -313,6 +312,15 @@ class Tracker:
         else:
             self._inquiry = inquiry
         return change
+
+
+def page_sum(before: Any, square: Any, size: int) -> Any:
+    """Page's sum of the log likelihood ratio of a larger variance, after one more innovation.
+
+    `square`: of `size` components; the sum is never negative.
+    """
+    gained = square * (1 - 1 / _AFTER) - size * np.log(_AFTER)
+    return np.maximum(0.0, before + gained / 2)
 
 
 def _plain(pose: Pose) -> dict[str, Any]:
