@@ -7,7 +7,8 @@ Photographs of five shapes at rest and a video (MJPEG in AVI, 60 frames a second
 the vision. The motion is simulated with 40 elements, the fit uses fewer. Each session writes its
 files to a temporary folder and is fitted like any other.
 
-Exit code 1 if a damping is off by more than 10 % or 3 std, or if EI lies outside of its interval.
+Exit code 1 if a damping is off by more than 10 % or 3 std, if EI lies outside of its interval, or
+if an effect is named: none is hidden.
 """
 
 from __future__ import annotations
@@ -57,15 +58,16 @@ class Row(NamedTuple):
     stiffness_std: float
     inside: bool
     found: tuple[str, ...]
+    verdict: str
     held: float
     note: str
     seconds: float
 
     @property
     def right(self) -> bool:
-        """Whether damping and EI are as they should be."""
+        """Whether damping and EI are as they should be, and nothing is named."""
         off = abs(self.damping - 1)
-        return self.inside and off < 0.1 and off < 3 * self.damping_std
+        return self.inside and off < 0.1 and off < 3 * self.damping_std and not self.found
 
 
 def board() -> FloatArray:
@@ -145,6 +147,7 @@ def work(case: Case) -> Row:
         *told,
         (low or 0.0) <= stiffness <= (np.inf if high is None else high),
         tuple(effect.name for effect in found.effects),
+        found.verdict or "",
         np.nan if last is None else last.rmse_fit,
         "" if last is None else last.shown[0].note,
         process_time() - begun,
@@ -156,7 +159,8 @@ def line(case: Case, row: Row, seconds: float) -> str:
     return (
         f"{case}: damping {row.damping:.3f} +- {row.damping_std:.3f} of the truth, EI "
         f"{row.stiffness:.4f} +- {row.stiffness_std:.4f} ({'inside' if row.inside else 'OUTSIDE'}),"
-        f" found {', '.join(row.found) or 'nothing'}, RMS {1e3 * row.held:.3f} mm; {row.note}; "
+        f" found {', '.join(row.found) or 'nothing'} ({row.verdict}), RMS "
+        f"{1e3 * row.held:.3f} mm; {row.note}; "
         f"{row.seconds:.0f} s{'' if row.right else '  WRONG'}"
     )
 
