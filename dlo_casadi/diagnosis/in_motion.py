@@ -9,9 +9,10 @@ of each: twice what it would gain, to first order, with all other unknowns fitte
 that the model has within a tolerance is free of it, and gains what the tolerance costs now, too.
 The best are fitted. What is then left of a motion is not independent in time: a gain counts as
 divided by c = m' J m / m' H m, with the variance J of the gradient (`told_by`) and the change m of
-all unknowns along the candidate. The best one is added if it is significant, as in the search among
-still poses, until none is. No misfit is asked for: an effect of six standard deviations leaves a
-thousand residuals at 1.02 times their noise.
+all unknowns along the candidate, and no more than the square of the effect's size in standard
+deviations, with what motions and still poses may differ by. The best one is added if it is
+significant, as in the search among still poses, until none is. No misfit is asked for: an effect of
+six standard deviations leaves a thousand residuals at 1.02 times their noise.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from dlo_casadi.estimation.motion_fit import (
     MotionFit,
     joined,
     rejoined,
+    repeated_fit,
     stretched,
     told_by,
     with_model,
@@ -173,7 +175,7 @@ def scored(now: MotionFit, listed: Sequence[Candidate]) -> dict[str, Score]:
     model = now.fit.model
     for item in listed:
         model = model if item.nuisance else item.add_to(model)
-    return _scores(with_model(now, model, {}), listed)
+    return _scores(with_model(now, model, {}, vanishes=True), listed)
 
 
 def heavy(model: CableModel, exclude: Sequence[str] = ()) -> list[Candidate]:
@@ -194,7 +196,7 @@ def scored_by_place(now: MotionFit, listed: Sequence[Candidate]) -> dict[str, Sc
     for item in listed:
         for scan in item.scans[_APART // 2 :: _APART]:
             try:
-                extended = with_model(now, item.add_to(now.fit.model), scan)
+                extended = with_model(now, item.add_to(now.fit.model), scan, vanishes=True)
             except EstimationError:
                 continue
             for name, one in _scores(extended, [item], item.screened).items():
@@ -253,6 +255,22 @@ def _excess(fit: MotionFit, item: Candidate) -> float:
     return largest
 
 
+def _square(fit: MotionFit, item: Candidate) -> float:
+    """Squared size of an effect in standard deviations, see `repeated_fit`.
+
+    Motions tell frequencies to 0.01 %, and repeat still poses to 0.1 %: what vanishes within that
+    is no effect, whatever it gains.
+    """
+    loose = repeated_fit(fit)
+    nominal = dict(zip(loose.model.names, loose.model.nominal, strict=True))
+    sizes = [
+        (loose.value(name) - nominal[name]) / std
+        for name in item.screened or item.frees
+        if (std := loose.std(name)) > 0
+    ]
+    return max((size**2 for size in sizes), default=0.0)
+
+
 def _best(
     start: MotionFit,
     now: MotionFit,
@@ -278,6 +296,7 @@ def _best(
         except EstimationError:
             continue
         gain = (now.objective - trial.objective) / _excess(trial, item)
+        gain = min(gain, _square(trial, item) / 2)
         fitted.append((gain - _price(item, level), item, trial))
     if not fitted:
         return None

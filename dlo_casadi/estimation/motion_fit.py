@@ -186,8 +186,13 @@ def rejoined(now: MotionFit, model: CableModel, values: Mapping[str, float]) -> 
     return joined(extended.fit, extended.motions, now.std, now.until)
 
 
-def with_model(now: MotionFit, model: CableModel, values: Mapping[str, float]) -> MotionFit:
-    """Another model at the values of a minimum, not fitted, with derivatives by its parameters."""
+def with_model(
+    now: MotionFit, model: CableModel, values: Mapping[str, float], *, vanishes: bool = False
+) -> MotionFit:
+    """Another model at the values of a minimum, not fitted, with derivatives by its parameters.
+
+    `vanishes`: whether what it has more vanishes there, so that it predicts the same.
+    """
     fit, problem = now.fit, now.still
     known = {**dict(zip(fit.model.names, fit.p, strict=True)), **values}
     nominal = dict(zip(model.names, model.nominal, strict=True))
@@ -201,7 +206,8 @@ def with_model(now: MotionFit, model: CableModel, values: Mapping[str, float]) -
     if point is None:
         raise EstimationError("a still pose is lost with another effect")
     extended = MotionFit(Fit(still, point), still, now.motions, now.std, converged=False)
-    return _stretched(extended, unknowns_in_motion(still.unknowns), now.until)
+    unknowns = unknowns_in_motion(still.unknowns)
+    return _stretched(extended, unknowns, now.until, known=vanishes)
 
 
 def joined(
@@ -227,13 +233,18 @@ def stretched(now: MotionFit, end: float) -> MotionFit:
     return _stretched(now, unknowns_in_motion(now.fit.problem.unknowns), end)
 
 
-def _stretched(now: MotionFit, unknowns: Unknowns, end: float) -> MotionFit:
-    """The same unknowns compared with points up to another time."""
+def _stretched(now: MotionFit, unknowns: Unknowns, end: float, *, known: bool = False) -> MotionFit:
+    """The same unknowns compared with points up to another time; `known`: up to the same."""
     moved = []
     for item in now.motions:
         recording = replace(item.recording, until=end)
         seen = recording.evaluate(
-            unknowns, now.fit.point.theta, item.own, item.seen.first, derivatives=True
+            unknowns,
+            now.fit.point.theta,
+            item.own,
+            item.seen.first,
+            derivatives=True,
+            known=item.seen if known else None,
         )
         moved.append(FittedMotion(recording, item.own, seen))
     return replace(now, motions=tuple(moved))

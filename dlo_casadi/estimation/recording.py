@@ -159,10 +159,12 @@ class Recording:
         near: State | None = None,
         *,
         derivatives: bool = False,
+        known: Seen | None = None,
     ) -> Seen:
         """Predicted minus measured points.
 
-        `near`: a first state near which that of these unknowns is sought.
+        `near`: a first state near which that of these unknowns is sought. `known`: what is
+        predicted there, if only derivatives are asked for.
 
         Raises
         ------
@@ -190,10 +192,15 @@ class Recording:
             fastest_steps(cable),
         )
         seen, by = self._seen(self._states(steps, held, first, numbers), held, numbers)
-        # The error of a step falls with the square of its length: extrapolated to zero.
-        finer = replace(self, dt=self.dt / 2)
-        fine, _ = finer._seen(finer._states(steps, held, first, None), held, None)
-        points, size = fine + (fine - seen) / 3, unknowns.size
+        size = unknowns.size
+        points: FloatArray
+        if known is None:
+            # The error of a step falls with the square of its length: extrapolated to zero.
+            finer = replace(self, dt=self.dt / 2)
+            fine, _ = finer._seen(finer._states(steps, held, first, None), held, None)
+            points = fine + (fine - seen) / 3
+        else:
+            points = known.points
         mask = np.isfinite(self.measured.points[: len(points), :, 0])
         residual = self.measured.deviations(points)[mask].ravel()
         if by is None:
