@@ -72,8 +72,6 @@ LEFT = 0.1
 # Distance from a held end, as a share of the length, within which a load and an error of the
 # fixture give the same shape: only the transmitted force and moment act beyond (Saint-Venant).
 NEAR_END = 0.1
-# Largest component across gravity of a force that may be a weight [std]: 95 % of a normal one.
-ALONG_GRAVITY = 2.0
 # Absolute correlation of two nuisances beyond which shapes cannot separate them: the variance of
 # each is then five times, 1 / (1 - 0.9^2), what it would be if the other were known.
 ALIKE = 0.9
@@ -86,13 +84,10 @@ REPEATS = 1.5
 # degree of freedom widens the intervals, and shapes are weighted by the noise of a single line.
 REPEATS_ARE_NOISE = 2.0
 
-# Ratio of white point errors to the declared noise beyond which they contradict it, and the fewest
-# degrees of freedom: three standard errors, 0.5 = 3 / sqrt(2 x 18). A cable's shape is never white:
-# in ten rendered sessions, most lacking an effect, the estimate was 0.97 to 1.02 of the truth.
-SCATTERED, SCATTERED_DEGREES = 1.5, 18
-# Distance of a point from its neighbours on the line, in robust standard deviations, beyond which
-# it is an outlier: by chance one point in 500 million.
-OUTLYING = 6.0
+# Fewest degrees of freedom of white point errors that may contradict the declared noise: NOTABLE
+# standard errors are then half of it. A cable's shape is never white: in ten rendered sessions,
+# most lacking an effect, the estimate was 0.97 to 1.02 of the truth.
+SCATTERED_DEGREES = 18
 
 # ---- intervals ---------------------------------------------------------------------------------
 
@@ -170,32 +165,22 @@ HEADING_OFF, HEADING_NEAR = 1.0, 0.5
 
 # ---- words -------------------------------------------------------------------------------------
 
-# Distance from a declared value, in its tolerances, beyond which a fit warns: by chance one in a
-# million. A length declared 0.1 m too long for 0.8 m ended 19 tolerances away.
-BEYOND_TOLERANCE = 5.0
-# Error of a fit pose over the median of all poses beyond which it is named: of ten poses, one with
-# five times the others' error makes the RMS 1.8 times theirs.
-FAR_OFF = 5.0
-# Normal score of residual structure beyond which it is reported: one in 370 by chance.
+# Standard deviations beyond which a difference is told: one in 370 by chance. Of residual
+# structure, of rivals that a measurement separates, of white errors from a declared noise, of the
+# lowest places of two shapes that may rest on the same table.
 NOTABLE = 3.0
-# Distance of a clamp from where both sides have equal energy, in standard deviations, within which
-# the side that a cable takes is unknown: 95 % of a normal distribution.
-EITHER = 2.0
-# Distance of rivals [standard deviations] beyond which they are separated: one in 370 by chance.
-APART = 3.0
+# The same where one of very many may be off: an outlier among points, a fitted value from its
+# tolerance, a pose from the others; one in 500 million by chance. A length declared 0.1 m too long
+# for 0.8 m ended 19 tolerances away.
+BEYOND_CHANCE = 6.0
 
 # ---- limits ------------------------------------------------------------------------------------
 
-# Probability of a violated limit below which it passes.
+# Probability that does not matter: of a violated limit that passes; of the difference, two standard
+# errors included, at which a first-order probability is reported instead of that of newly solved
+# shapes. With 0.02, two of 30 differed by 2.2 and 2.5 points from the share of 10,000 draws, whose
+# own standard error is up to 0.5.
 SAFE = 0.01
-# Largest difference, two standard errors included, at which a first-order probability is reported
-# instead of that of newly solved shapes. With 0.02, two of 30 differed by 2.2 and 2.5 points from
-# the share of 10,000 draws, whose own standard error is up to 0.5.
-FIRST_ORDER = 0.01
 # Relative change of the smallest bend radius on half the element size, below which the mesh
 # resolves it: with second order, a third of the change remains.
 RESOLVED = 0.01
-# Largest distance between the lowest places of two shapes that may rest on the same table: in
-# standard deviations of a point, and its bounds in lengths of the cable. It decides whether a plane
-# is tried, not whether it is found.
-RESTING_NOISE, RESTING_APART = 3.0, (3e-3, 1e-2)

@@ -16,7 +16,7 @@ from dlo_casadi.estimation.prediction import Prediction, predict_each, uncertain
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.rod.quantities import quantity_of
-from dlo_casadi.thresholds import APART
+from dlo_casadi.thresholds import NOTABLE
 
 # Number of trial directions of the clamp for a pose that would separate two models.
 HEADINGS = 12
@@ -123,7 +123,7 @@ class NextPose:
         covariance of what differs from one measurement to the next: noise, fixtures and the cable's
         own scatter. P is that of the parameters of both fits, which new fits could change.
     times : int or None
-        Number m of measurements that separate them by APART standard deviations; None if
+        Number m of measurements that separate them by NOTABLE standard deviations; None if
         MOST_REPEATS do not.
     reading : NextReading
         Measurement of a sensor at a fixture that separates them best there.
@@ -204,7 +204,7 @@ def next_pose(first: Fit, second: Fit) -> NextPose | None:
         one.curve, s, np.concatenate([gap[..., None], again, moved, open_too], axis=2)
     )
     found = _separations(*np.split(seen, [1, 1 + again.shape[2]], axis=1))
-    times = next((m for m, apart in enumerate(found, 1) if apart >= APART), None)
+    times = next((m for m, apart in enumerate(found, 1) if apart >= NOTABLE), None)
     reading = next_reading(first, one.seen, other.seen)
     return NextPose(place, difference, float(found[0]), times, reading)
 
@@ -219,7 +219,7 @@ def next_reading(fit: Fit, one: Observed, other: Observed) -> NextReading:
         known = [fit.std(own) for own in fit.model.names if f".{name}" in own]
         bias = max(known, default=getattr(tolerances, quantity.bias_key))
         difference = float(np.linalg.norm(one.readings[at] - other.readings[at]))
-        left = (difference / APART) ** 2 - bias**2
+        left = (difference / NOTABLE) ** 2 - bias**2
         times = int(np.ceil(std**2 / left)) if left > 0 else None
         found.append(NextReading(name, difference, difference / float(np.hypot(std, bias)), times))
     return max(found, key=lambda item: item.separation)

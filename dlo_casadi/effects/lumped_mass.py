@@ -8,7 +8,7 @@ import numpy as np
 from dlo_casadi.effects.acting import MassAt, PointForceAt
 from dlo_casadi.effects.cable import CableData, Parameter
 from dlo_casadi.effects.effect import Fitted, Params, PointLoad
-from dlo_casadi.thresholds import ALONG_GRAVITY
+from dlo_casadi.thresholds import NORMAL_95
 
 
 class LumpedMass(PointLoad):
@@ -56,5 +56,5 @@ class LumpedMass(PointLoad):
         place, field = ca.SX.zeros(len(down)), ca.SX(ca.DM(gravity))
         force, moved = found.propagated(lambda params: effect.force(place, field, params))
         across = np.eye(len(down)) - np.outer(down, down)
-        limit = ALONG_GRAVITY * np.linalg.norm(across @ moved)
+        limit = NORMAL_95 * np.linalg.norm(across @ moved)
         return bool(force @ down > 0 and np.linalg.norm(across @ force) < limit)

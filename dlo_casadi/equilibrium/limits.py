@@ -21,13 +21,13 @@ from dlo_casadi.model.clips import tangents
 from dlo_casadi.model.contact import outwards
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.rod.ends import reaction_rows
-from dlo_casadi.thresholds import FIRST_ORDER, RESOLVED, SAFE
+from dlo_casadi.thresholds import RESOLVED, SAFE
 
 # Number of draws that are solved to check the first order; number if it does not suffice; number
 # of draws of the linearised shapes, which cost next to nothing; number of shapes solved at a time.
 PAIRED, DRAWN, LINEAR, CHUNK = 600, 2000, 4000, 500
 # First-order probabilities between which solved draws decide whether a limit is kept.
-IN_DOUBT = SAFE / 10, SAFE + FIRST_ORDER
+IN_DOUBT = SAFE / 10, 2 * SAFE
 # Largest step [rad] of a node at which a draw counts as solved: its size need not be exact.
 _TOLERANCE = 1e-6
 # Step of finite differences along a derivative of the shape, in standard deviations.
@@ -172,7 +172,7 @@ class Varied(Repeats):
 
         over z across the direction of the likeliest place; on its line, g stays within the bound
         between t_low and t_high. Newly solved draws show whether this suffices. It does not if
-        their probability differs by more than `thresholds.FIRST_ORDER`, two standard errors
+        their probability differs by more than `thresholds.SAFE`, two standard errors
         included, or if the verdict depends on it. The probability is then counted among more solved
         draws and corrected by the first-order result of the same draws (`_counted`).
 
@@ -301,7 +301,7 @@ def _agree(anew: BoolArray, linear: BoolArray) -> bool:
     """Whether solved draws confirm the first-order probability, within two standard errors."""
     apart = anew.astype(float) - linear
     error = float(np.sqrt((apart**2).mean() / len(apart)))
-    return bool(abs(apart.mean()) + 2 * error <= FIRST_ORDER)
+    return bool(abs(apart.mean()) + 2 * error <= SAFE)
 
 
 def _counted(anew: BoolArray, linear: BoolArray, expected: float) -> tuple[float, float]:

@@ -21,7 +21,7 @@ from dlo_casadi.equilibrium.solve import solve_equilibrium, ways_of
 from dlo_casadi.model.assembly import Assembly, Inputs, Shapes, Tangents
 from dlo_casadi.model.cable_model import END_ROLL, CableModel
 from dlo_casadi.model.pose_scatter import PoseScatter
-from dlo_casadi.thresholds import EITHER
+from dlo_casadi.thresholds import NORMAL_95
 
 # Share of new repeats inside the band, and its half width in standard deviations.
 COVERED = 0.9
@@ -352,7 +352,7 @@ class Tipping:
     @property
     def either(self) -> bool:
         """Whether it is uncertain which side is the lower one."""
-        return self.angle < max(EITHER * self.std, _ROUNDING)
+        return self.angle < max(NORMAL_95 * self.std, _ROUNDING)
 
 
 def energy_slope(held: SolvedCable, along: Sequence[FloatArray], step: float) -> FloatArray:

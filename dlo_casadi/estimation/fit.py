@@ -32,7 +32,7 @@ from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel, ReadingNoise
-from dlo_casadi.thresholds import LACKING_SHARE, MESH_SHARE, RESTING_APART, RESTING_NOISE
+from dlo_casadi.thresholds import BEYOND_EFFECTS, LACKING_SHARE, MESH_SHARE, NOTABLE, UNEXPLAINED
 
 # Std of points over length used as weight in a fit whose model cannot meet them any better.
 MISFIT_STD = 0.01
@@ -331,8 +331,9 @@ def resting_height(problem: Problem) -> float | None:
     for k, item in enumerate(problem.fit_poses):
         known = height_of(item.traced.points, model.gravity) if item.has_line else heights[k]
         highest[k] = max(lowest[k], known.min(initial=highest[k]))
-    least, most = (share * length for share in RESTING_APART)
-    apart = np.clip(RESTING_NOISE * problem.noise.of_points.std, least, most)
+    # It decides whether a plane is tried, not whether it is found.
+    least, most = UNEXPLAINED * length, BEYOND_EFFECTS * length
+    apart = np.clip(NOTABLE * problem.noise.of_points.std, least, most)
     shared = (inside > 0) & (inside < len(places) - 1) & (lowest < highest.min() + apart)
     height = np.maximum(lowest, highest.min())[shared]
     return float(height.mean()) if len(height) > 1 else None

@@ -23,7 +23,7 @@ from dlo_casadi.model.pose_scatter import MODES, PoseScatter, sources_in
 from dlo_casadi.rod.quantities import FORCE, MOMENT, QUANTITIES
 from dlo_casadi.sensing.noise import NoiseModel, ReadingNoise, smooth_modes
 from dlo_casadi.sensing.noise_estimate import NoiseSample, estimate_noise, tell_of_noise
-from dlo_casadi.thresholds import SCATTER_APART, SCATTERED, SCATTERED_DEGREES
+from dlo_casadi.thresholds import NOTABLE, SCATTER_APART, SCATTERED_DEGREES
 
 # Number of slow displacements per pose kept out of the noise estimate: many while an effect may be
 # missing, few once the model is taken as complete, because noise is also slow.
@@ -108,7 +108,7 @@ def contradicted(fit: Fit) -> bool:
     if not tell_of_noise(samples, SCATTERED_DEGREES):
         return False
     found = estimate_noise(samples, fit.model.cable.length)
-    return found.white > SCATTERED * fit.noise.std
+    return found.white > (1 + NOTABLE / np.sqrt(2 * SCATTERED_DEGREES)) * fit.noise.std
 
 
 def errors_of(

@@ -16,7 +16,7 @@ from dlo_casadi.rod.quantities import QUANTITIES
 from dlo_casadi.session.outcome import PoseInput
 from dlo_casadi.session.outliers import outliers_of
 from dlo_casadi.session.sentences import Sentence, Values, said_of
-from dlo_casadi.thresholds import BEYOND_TOLERANCE, DIFFERENT, FIXTURES
+from dlo_casadi.thresholds import BEYOND_CHANCE, DIFFERENT, FIXTURES
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ def _beyond_tolerances(x: Judged) -> Iterator[Values]:
         if tolerance is None or (q.name.startswith(hidden) and not of_sensor):
             continue
         moved = fit.value(q.name) - q.nominal
-        if abs(moved) > BEYOND_TOLERANCE * tolerance:
+        if abs(moved) > BEYOND_CHANCE * tolerance:
             times = abs(moved) / tolerance
             unit = f" {q.unit}".rstrip()
             yield {

@@ -17,7 +17,7 @@ from dlo_casadi.estimation.result import Fit
 from dlo_casadi.io.points import MeasuredPoints
 from dlo_casadi.sensing.sensors import line_or_markers
 from dlo_casadi.session.outcome import PoseInput
-from dlo_casadi.thresholds import OUTLYING
+from dlo_casadi.thresholds import BEYOND_CHANCE
 
 # Number of neighbours with which a point is compared; smallest number of points of a line that is
 # judged, twice a point with its neighbours. Seven simulated sessions that lack an effect have no
@@ -77,7 +77,7 @@ class _Line(NamedTuple):
 
 
 def outliers_of(fit: Fit, poses: Sequence[PoseInput]) -> Outliers:
-    """Points of the fit poses that are OUTLYING standard deviations off their neighbours.
+    """Points of the fit poses that are BEYOND_CHANCE standard deviations off their neighbours.
 
     `poses`: all poses of the fit, as measured. Photographs of a cable in space are not judged:
     their pixels are averages along the cable.
@@ -144,7 +144,7 @@ def _inliers(series: Sequence[FloatArray]) -> tuple[list[BoolArray], float]:
                 np.concatenate([one[own].ravel() for one, own in zip(off, kept, strict=True)])
             )
         )
-        least = [OUTLYING * np.maximum(std, near) for _, near in beside]
+        least = [BEYOND_CHANCE * np.maximum(std, near) for _, near in beside]
         now = [
             own & (one <= limit).all(axis=1)
             for own, one, limit in zip(kept, off, least, strict=True)

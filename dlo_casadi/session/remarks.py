@@ -13,7 +13,7 @@ from dlo_casadi.estimation.result import Fit
 from dlo_casadi.session.outcome import SIMPLER, PoseInput, Stage
 from dlo_casadi.session.outliers import LEAST_POINTS, Outliers
 from dlo_casadi.session.pose_shape import BranchShape, PoseShape
-from dlo_casadi.thresholds import FAR_OFF, UNSEEN
+from dlo_casadi.thresholds import BEYOND_CHANCE, UNSEEN
 
 CUT_OFF = (
     "the diagnosis has met the bound on its work before everything was tried, as where several "
@@ -285,7 +285,7 @@ def far_off(stage: Stage, poses: Sequence[PoseInput], told: Sequence[str] = ()) 
     rmse = {name: x.rmse for name, x in stage.shapes.items() if x.rmse is not None}
     usual = float(np.median([*rmse.values()])) if len(rmse) > 2 else np.inf
     fitted = [pose.name for pose in poses if pose.role == "fit"]
-    bad = [name for name in fitted if rmse.get(name, 0.0) > FAR_OFF * usual]
+    bad = [name for name in fitted if rmse.get(name, 0.0) > BEYOND_CHANCE * usual]
     bad = [name for name in bad if not any(name in text for text in told)]
     if not bad:
         return []
