@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import depth_first_order, minimum_spanning_tree
 from dlo_casadi.arrays import FloatArray, chord_lengths
 from dlo_casadi.errors import MeasurementError, counted
 from dlo_casadi.recordings.fixtures import Gripper
-from dlo_casadi.thresholds import STRETCHED
+from dlo_casadi.thresholds import FITS
 
 LONGER = 0.03  # relative difference of declared and measured length beyond which one is a mistake
 _FEW = 4  # markers through which a spline is often shorter than the cable
@@ -158,7 +158,7 @@ def check_arc_lengths(
     chords = np.linalg.norm(np.diff(places, axis=0), axis=2)  # (M - 1, P)
     excess = np.nanmax(chords, axis=1, initial=0.0) - np.diff(s)
     k = int(np.argmax(excess))
-    if excess[k] > STRETCHED * length:
+    if excess[k] > FITS * length / 2:
         pose = int(np.nanargmax(chords[k])) + 1
         cause = f"{counted(len(s), 'marker')} are too few for that"
         if len(s) > _FEW:

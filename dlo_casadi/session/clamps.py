@@ -8,7 +8,7 @@ from dlo_casadi.session.compared_clamps import Clamps, ShownDirection, shown_dir
 from dlo_casadi.session.mistakes import DIRECTIONS
 from dlo_casadi.session.questions import Alternatives, Suspicion
 from dlo_casadi.session.read_session import ReadSession
-from dlo_casadi.thresholds import HEADING_NEAR, NEARLY_ALL
+from dlo_casadi.thresholds import HEADING_OFF, NEARLY_ALL
 
 _RULE = {
     "heading": "headings in radians, counter-clockwise from x, along the cable",
@@ -18,7 +18,7 @@ _RULE = {
 _MEANT = Alternatives(
     DIRECTIONS,
     lambda clamps: float(np.quantile([item.off for item in clamps.shown], NEARLY_ALL)),
-    enough=HEADING_NEAR,
+    enough=HEADING_OFF / 2,
     near=1.0,
 )
 

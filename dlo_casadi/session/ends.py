@@ -23,14 +23,10 @@ from dlo_casadi.session.mistakes import (
 from dlo_casadi.session.questions import Alternatives, Suspicion
 from dlo_casadi.session.read_session import ReadSession
 from dlo_casadi.thresholds import (
-    CONTRADICTS,
     FITS,
     MUCH_BETTER,
     NEAR_UNIT,
     NEARLY_ALL,
-    OUT_OF_STEP,
-    SHORTER,
-    STRETCHED,
     TOO_LONG,
 )
 
@@ -57,7 +53,7 @@ _LENGTHS = Alternatives(
 )
 _SPANS = Alternatives(UNITS_OF_ENDS, _off_spans, enough=_FEW_OFF)
 _COUNTED = Alternatives(COUNTED, _off_fixtures, FITS, FITS, MUCH_BETTER)
-_FRAMES = Alternatives(FRAMES, _off_fixtures, CONTRADICTS, FITS, MUCH_BETTER)
+_FRAMES = Alternatives(FRAMES, _off_fixtures, 2 * FITS, FITS, MUCH_BETTER)
 _FITTED = Alternatives(FITTED_FRAMES, _off_fixtures, FITS, FITS, MUCH_BETTER, near=1.0)
 
 
@@ -65,7 +61,7 @@ def wrong_units(session: ReadSession) -> tuple[Suspicion, ...]:
     """Lengths, or distances of the ends, that are off by the factor of a unit."""
     lines = session.lines
     declared, measured = lines.spans
-    far = np.maximum(declared, measured) > CONTRADICTS * lines.length
+    far = np.maximum(declared, measured) > 2 * FITS * lines.length
     apart = np.isfinite(declared) & far
     whole = np.mean(lines.gaps.max(axis=1) < FITS * lines.length) >= NEARLY_ALL
     ends = [lines.of(apart)] * bool(apart.sum() > 1 and whole)
@@ -95,7 +91,7 @@ def out_of_step(session: ReadSession) -> tuple[Suspicion, ...]:
     own, order = np.diag(misfit), np.arange(len(misfit))
     _, best = linear_sum_assignment(misfit**2)
     other = misfit[order, best]
-    wrong = (own > OUT_OF_STEP) & (other < np.minimum(FITS, MUCH_BETTER * own))
+    wrong = (own > FITS) & (other < np.minimum(FITS, MUCH_BETTER * own))
     if wrong.sum() < 2:
         return ()
     pairs = [
@@ -143,7 +139,7 @@ def single_poses(session: ReadSession) -> tuple[Suspicion, ...]:
             ),
         ),
         (
-            own > CONTRADICTS,
+            own > 2 * FITS,
             lambda i: (
                 f"its line runs from ({listed(lines.measured[i, 0])}) to "
                 f"({listed(lines.measured[i, 1])}) m, {own[i] * lines.length:.3g} m RMS away from "
@@ -185,7 +181,7 @@ def stretched(session: ReadSession) -> tuple[Suspicion, ...]:
     for name, points, s in marked:
         chords, along = np.linalg.norm(np.diff(points, axis=0), axis=1), np.diff(s)
         k = int((chords - along).argmax()) if len(along) else 0
-        if len(along) and chords[k] - along[k] > STRETCHED * session.config.cable.length:
+        if len(along) and chords[k] - along[k] > FITS * session.config.cable.length / 2:
             texts[name] = (
                 f"its markers at s_m {s[k]:g} and {s[k + 1]:g} are {chords[k]:.4g} m apart, the "
                 f"cable between them is {along[k]:.4g} m long"
@@ -227,7 +223,7 @@ def shorter(session: ReadSession) -> tuple[Suspicion, ...]:
         turned = np.maximum(np.append(turns, turns[-1:]), np.append(turns[:1], turns))
         least, gap = float(chords.sum()), float(chords.max(initial=0.0))
         missed = float((chords * turned**2).sum() / 24)
-        if length - least - missed > max(SHORTER * length, gap):
+        if length - least - missed > max(FITS * length, gap):
             lines.append((least, gap))
     if len(lines) < max(2, NEARLY_ALL * len(read)):
         return ()

@@ -18,7 +18,7 @@ from dlo_casadi.session.compared_readings import ComparedReading, Readings
 from dlo_casadi.session.compared_shapes import FittedSession
 from dlo_casadi.session.lines import Lines
 from dlo_casadi.session.questions import Mistake
-from dlo_casadi.thresholds import CONTRADICTS, TURNED
+from dlo_casadi.thresholds import FITS, MUCH_BETTER
 
 # All ways to exchange and mirror axes in a plane and in space, but for the identity.
 AXES = tuple(axes for d in (2, 3) for axes in exchanges(d)[1:])
@@ -98,7 +98,7 @@ FRAMES: tuple[Mistake[Lines], ...] = (
     *(Mistake(_IN_FRAME, _in_axes(axes, moved=moved)) for moved in (False, True) for axes in AXES),
 )
 FITTED_FRAMES: tuple[Mistake[Lines], ...] = tuple(
-    Mistake(_IN_FRAME, _near_axes(axes), CONTRADICTS) for d in (2, 3) for axes in exchanges(d)
+    Mistake(_IN_FRAME, _near_axes(axes), 2 * FITS) for d in (2, 3) for axes in exchanges(d)
 )
 
 # ---- directions of clamps -----------------------------------------------------------------------
@@ -194,7 +194,7 @@ READINGS: tuple[Mistake[ComparedReading], ...] = (
         Mistake(
             f"once read as ({read_as(axes)}). Try: the axes of start and end.",
             _with_axes(axes),
-            TURNED,
+            MUCH_BETTER,
         )
         for axes in AXES
         if not np.array_equal(axes, -np.eye(len(axes)))  # the other sign
@@ -202,7 +202,7 @@ READINGS: tuple[Mistake[ComparedReading], ...] = (
     Mistake(
         "once all are turned by {meant.how} degrees. Try: the axes of start and end.",
         lambda one: one.turned(),
-        TURNED,
+        MUCH_BETTER,
     ),
 )
 

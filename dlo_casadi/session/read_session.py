@@ -11,7 +11,7 @@ from dlo_casadi.config import Config, Pose
 from dlo_casadi.session.lines import Lines
 from dlo_casadi.session.measure import line_without_end
 from dlo_casadi.session.outcome import PoseInput
-from dlo_casadi.thresholds import FITS, OUT_OF_STEP
+from dlo_casadi.thresholds import FITS
 
 # Number of points used to measure a line's length: noise lengthens a line of many points.
 _SPARSE = 60
@@ -39,7 +39,7 @@ class ReadSession:
         experiment, found = self.config.experiment, {item.name: item for item in self.read}
         lines = _lines(self.config, found)
         if experiment.boundary.end.place:
-            fits = lines.misfit(lines.measured, lines.declared) < OUT_OF_STEP
+            fits = lines.misfit(lines.measured, lines.declared) < FITS
             sound = {name for name, ok in zip(lines.names, fits, strict=True) if ok}
             poses = [pose for pose in experiment.poses if pose.name not in sound]
             doubtful = [pose for pose in poses if pose.paths and pose.paths[0].is_file()]

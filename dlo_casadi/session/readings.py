@@ -12,6 +12,7 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config import Config, Pose
+from dlo_casadi.effects.mass_error import MassError
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.prediction import predict_each
 from dlo_casadi.estimation.result import Fit
@@ -29,10 +30,7 @@ from dlo_casadi.session.read_session import ReadSession, spread
 from dlo_casadi.thresholds import (
     MISREAD,
     MUCH_BETTER,
-    READ_ALONE,
     READ_OTHERWISE,
-    READ_SCALE,
-    TURNED,
     UNEXPLAINED,
     UNSEEN,
 )
@@ -123,7 +121,7 @@ def _frames(model: CableModel, poses: Sequence[Pose], name: str) -> FloatArray |
 _ALONE = Alternatives(
     READINGS_ALONE,
     lambda readings: readings.misfit,
-    READ_ALONE,
+    MUCH_BETTER,
     share=MUCH_BETTER,
     words="{was.said}: {own:.0%} off what a straight cable of any stiffness gives, but {left:.0%} "
     "{row}",
@@ -191,7 +189,7 @@ def misread(
             found.append(_BESIDE_SHAPES.suspicion(meant))
             one = meant.meant
         elif own > MISREAD:
-            doubted = explained and own > TURNED
+            doubted = explained and own > MUCH_BETTER
             found += [Suspicion(_UNLIKE.format(one.name, own), False)] * doubted
             continue
         scales[one.name] = one.scale
@@ -223,7 +221,8 @@ def _other_unit(name: str, scale: float, beside: str, *, told: bool = False) -> 
 
     `told`: `beside` is a reading, whose unit may as well be the wrong one.
     """
-    if 1 / READ_SCALE < scale < READ_SCALE:
+    (factor,) = MassError.declared  # a wrong mass scales the shapes' forces
+    if factor.lower < scale < factor.upper:
         return
     cures, pairs = [], [("", name, scale), (f"{beside} ", beside, 1 / scale)]
     for whose, one, factor in pairs[: 1 + told]:
