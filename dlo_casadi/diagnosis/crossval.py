@@ -30,7 +30,7 @@ from scipy.special import stdtr
 from dlo_casadi.arrays import FloatArray, root_of
 from dlo_casadi.equilibrium.curve import Observed
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.descent import descend
+from dlo_casadi.estimation.descent import NEARLY, descend
 from dlo_casadi.estimation.fit import explains
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Values
@@ -41,8 +41,6 @@ from dlo_casadi.thresholds import EVIDENCE_APART
 
 # Number of stretches into which the arc of a single pose is cut.
 STRETCHES = 5
-# Steps of a fit without a pose, and the decrease of the objective at which it ends.
-REFIT_STEPS, REFIT_TOLERANCE = 3, 0.1
 # Draws of the unknowns that show how far chance moves a left-out pose: it is at a fold if one of
 # them moves it as far as it was predicted off. Evidence: a complete model predicted one pose of a
 # clean cable 43 mm off, 3 mm were expected on average, and 7 of 20 draws moved it farther.
@@ -214,7 +212,7 @@ def _fitted_without(fit: Fit, k: int) -> FloatArray | None:
     with suppress(EstimationError, np.linalg.LinAlgError):
         point = others.balanced(Values(fit.point.theta, shapes, places))
         if point is not None:
-            return descend(Fit(others, point), REFIT_STEPS, REFIT_TOLERANCE).point.theta
+            return descend(Fit(others, point), tolerance=NEARLY).point.theta
     return None
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dlo_casadi.diagnosis.gram import Screened
-from dlo_casadi.estimation.fit import FIRST_STD
+from dlo_casadi.estimation.fit import EXPLAINED, FIRST_STD
 from dlo_casadi.estimation.measured_shapes import measured_shapes
 from dlo_casadi.estimation.problem import Priors, Problem
 from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation
@@ -33,9 +33,8 @@ from dlo_casadi.model.cable_model import END_ROLL, CableModel
 from dlo_casadi.runtime.work import accounted_as
 from dlo_casadi.sensing.noise import NoiseModel
 
-# Softness [rad] at which candidates may be scored; largest sum of squares per residual at which
-# relaxed shapes still count as the measured ones.
-SCORED, MEASURED = (1e-1, 3e-2, 1e-2), 2.0
+# Softness [rad] at which candidates may be scored.
+SCORED = (1e-1, 3e-2, 1e-2)
 # Softness [rad] through which candidates are relaxed before they are compared; largest objective of
 # a candidate relative to the least one where that is noise: differences are then twice those of log
 # likelihoods, a tenth of hundreds is beyond doubt. A soft balance is less informative for a
@@ -43,9 +42,6 @@ SCORED, MEASURED = (1e-1, 3e-2, 1e-2), 2.0
 # leave that need not balance; in three sessions without a table, a contact left 5 to 22 times the
 # least.
 COMPARED, NEAR_NOISE = SOFTNESS[:4], 1.1
-# Largest sum of squares per residual at which a start counts as having reached the noise; where
-# shapes that need not balance leave more than the noise, relative to what they leave.
-REACHED = 1.5
 # Sum of squares per residual that most poses leave, above which no pose is tried again: not a pose,
 # but the candidate is wrong. In a session in space seven of thirteen such starts gained by a second
 # trial of outlying poses, but none came below 20 times the noise, and it took half of the time.
@@ -91,7 +87,7 @@ def _from_data_on(base: Fit, mesh: int) -> tuple[Fit, float]:
     for softness in SCORED:
         values = Relaxation(problem, softness).solve(values)
         near = Fit(problem, problem.evaluate(values))
-        if best is not None and near.point.data > MEASURED * problem.n_residuals:
+        if best is not None and near.point.data > EXPLAINED * problem.n_residuals:
             break
         best = near, softness
     assert best is not None
@@ -215,7 +211,7 @@ class RelaxedStart:
     @property
     def reached(self) -> bool:
         """Whether it leaves no more than the noise that the relaxed shapes of `near` show."""
-        return self.left < REACHED * expected_left(self.near)
+        return self.left < EXPLAINED * expected_left(self.near)
 
     @property
     def names(self) -> set[str]:

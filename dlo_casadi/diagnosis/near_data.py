@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 
 from dlo_casadi.diagnosis.candidates import Candidate
-from dlo_casadi.diagnosis.from_data import NEAR_NOISE, REACHED, RelaxedStart, expected_left
+from dlo_casadi.diagnosis.from_data import NEAR_NOISE, RelaxedStart, expected_left
 from dlo_casadi.diagnosis.gram import (
     Screened,
     in_order,
@@ -23,7 +23,6 @@ from dlo_casadi.diagnosis.gram import (
     survival,
 )
 from dlo_casadi.diagnosis.refits import (
-    MOST_STEPS,
     Confirmed,
     Tried,
     at_noise,
@@ -33,7 +32,7 @@ from dlo_casadi.diagnosis.refits import (
 from dlo_casadi.diagnosis.screening import RelaxedScreen, Screen
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import NEARLY, descend
-from dlo_casadi.estimation.fit import explains, misfits
+from dlo_casadi.estimation.fit import EXPLAINED, explains, misfits
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.runtime.work import UNBOUNDED, Bound, accounted_as
@@ -45,12 +44,10 @@ from dlo_casadi.thresholds import REFITTED
 BEST = 3
 # Largest number of candidates found at once.
 LARGEST = 3
-# Largest objective of a start that is fitted, relative to the least one. In two sessions in space
-# the hidden effect left 3105 and 8250, its only rival 8051, and all others 27800 and more.
-NEAR_LEAST = 3.0
-# Sum of squares per residual, in multiples of the noise, up to which single candidates are fitted
-# before pairs are started; a fit below it ends the search: what it lacks is found in the
-# next step.
+# Ratio of what two starts leave, or of what one leaves to the noise, within which they are close.
+# Starts close to the best one are fitted: in two sessions in space the hidden effect left 3105 and
+# 8250, its only rival 8051, and all others 27800 and more. Single candidates close to the noise are
+# fitted before pairs are started; what a fit close to it lacks is found in the next step.
 CLOSE = 3.0
 
 NOT_NEAR = "does not come near the measured shapes"
@@ -109,7 +106,7 @@ def near_data(
     first = gram.subsets(1, REFITTED) if gram else []
     begun = map_in_order(executor, begin, [*((x,) for x in contacts), *first])
     touches, starts = begun[: len(contacts)], begun[len(contacts) :]
-    most = NEAR_LEAST * min((start.left for start in begun), default=np.inf)
+    most = CLOSE * min((start.left for start in begun), default=np.inf)
     touches = [start for start in touches if start.left <= most]
     touching = [x for x in map_in_order(executor, partial(confirm_contact, base), touches) if x]
     explained = any(explains(item.fit) for item in touching)
@@ -129,7 +126,7 @@ def near_data(
             new = [x for point in points for x in point.subsets(size, BEST)]
             new = [x for x in _distinct(new) if _names(x) not in known]
             starts += map_in_order(executor, begin, new)
-        close = _near_least([x for x in starts if x not in kept], REACHED * noise, least)
+        close = _near_least([x for x in starts if x not in kept], EXPLAINED * noise, least)
         if size == 1 < largest and not bound.met and not (close and close[0].left < CLOSE * noise):
             continue
         rolls = not (explained or bound.met)
@@ -170,7 +167,7 @@ def _near_least(
     """Starts whose objective is close to the least one, best first."""
     ordered = sorted(begun, key=lambda x: x.left)
     least = min([least, *(x.left for x in ordered[:1])])
-    most = least * (NEAR_NOISE if least < noise else NEAR_LEAST)
+    most = least * (NEAR_NOISE if least < noise else CLOSE)
     return [start for start in ordered if start.left <= most]
 
 
@@ -185,7 +182,7 @@ def confirmed(
 ) -> tuple[list[RelaxedStart], list[Confirmed]]:
     """The starts that are fitted, best first, and their fits.
 
-    Once a fit explains the shapes, others are fitted only if their starts leave less than REACHED
+    Once a fit explains the shapes, others are fitted only if their starts leave less than EXPLAINED
     times as much as the best. Until one does, with `rolls` other end rolls are tried.
     """
     fitted: list[RelaxedStart] = []
@@ -195,7 +192,7 @@ def confirmed(
         return any(item is not None and explains(item.fit) for item in found)
 
     for start in starts:
-        if explained() and start.left >= REACHED * starts[0].left:
+        if explained() and start.left >= EXPLAINED * starts[0].left:
             continue
         item = confirm_from_data(base, start)
         fitted.append(start)
@@ -236,7 +233,7 @@ def confirm_contact(base: Fit, start: RelaxedStart) -> Confirmed | None:
         same = item.fit.reweighed(base.noise, base.problem.priors)
     except EstimationError:  # a pose needs what is random in it: no gain can be computed
         return item
-    fit = followed(same, same.model, {}, MOST_STEPS) or same
+    fit = followed(same, same.model, {}) or same
     gain = max(2 * (base.point.objective - fit.point.objective), 0.0)
     values = {name: item.fit.value(name) for name in screened.candidate.frees}
     p_value = survival(gain, len(values), np.inf)

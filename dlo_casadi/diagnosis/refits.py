@@ -53,8 +53,6 @@ ONE_PLACE = 1.0
 # A refit is given up if its minimum is predicted above that of a known one by more than this (ten
 # times the log likelihood by which a rival may fall short) and by more than the known minimum.
 GIVEN_UP = 10 * EVIDENCE_APART
-# Maximum number of Gauss-Newton steps of a refit, and of one that starts from scattered forces.
-MOST_STEPS, STEPS_FROM_FORCES = 25, 60
 
 
 @dataclass(frozen=True)
@@ -166,7 +164,7 @@ def scored_by_refit(
     contact leaves hardly less than the base in relaxed shapes (less than a tenth).
     """
     start = dict(candidate.scans[0])
-    fits = [followed(base, candidate.add_to(base.model), start, MOST_STEPS)]
+    fits = [followed(base, candidate.add_to(base.model), start)]
     if from_shapes:
         near, _ = from_data(base)
         most = left_without(near) / NEAR_NOISE
@@ -176,7 +174,7 @@ def scored_by_refit(
             fit = begun.fit() if begun.left < most else None
         if fit is not None:
             fit = fit.reweighed(base.noise, base.problem.priors)
-            fits.append(followed(fit, candidate.add_to(base.model), {}, MOST_STEPS))
+            fits.append(followed(fit, candidate.add_to(base.model), {}))
     best = min((x for x in fits if x), key=lambda x: x.point.objective, default=None)
     if best is None:
         return Screened(candidate, 0.0, 1.0, start)
@@ -199,7 +197,7 @@ def confirm(
         same = beside.weighed_as(base)
         model = screened.candidate.add_to(base.model)
         starts: tuple[Mapping[str, float], ...] = (screened.start, {})
-        fits = [found, *(followed(same, model, values, MOST_STEPS, ceiling) for values in starts)]
+        fits = [found, *(followed(same, model, values, ceiling) for values in starts)]
         found = min((x for x in fits if x), key=lambda x: x.point.objective, default=None)
     return Confirmed.of(screened, base, found)
 
@@ -211,7 +209,7 @@ def confirm_cause(base: Fit, force: UnknownForce, screened: Screened) -> Confirm
     """
     forces = force.force_per_pose
     values = start_from(force.fit, force.position, forces, screened.candidate)
-    fit = followed(force.fit, screened.candidate.add_to(base.model), values, STEPS_FROM_FORCES)
+    fit = followed(force.fit, screened.candidate.add_to(base.model), values)
     if fit is not None and base.noise.before is not None and not misfits(fit):
         fit = at_noise(fit, base.noise.before)
     return Confirmed.of(screened, base, fit)
@@ -231,12 +229,11 @@ def followed(
     start: Fit,
     model: CableModel,
     values: Mapping[str, float],
-    steps: int = 40,
     ceiling: float = np.inf,
 ) -> Fit | None:
     """Refit of a model with new parameters at these values; None without equilibria."""
     with suppress(EstimationError):
-        return refit(start, model, values=values, steps=steps, tolerance=NEARLY, ceiling=ceiling)
+        return refit(start, model, values=values, tolerance=NEARLY, ceiling=ceiling)
     return None
 
 
@@ -255,7 +252,7 @@ def refit_with(base: Fit, *each: Screened, ceiling: float = np.inf) -> Fit | Non
             name: begin[name] + (share if name in linear else 1.0) * (value - begin[name])
             for name, value in start.items()
         }
-        fit = followed(base, model, values, MOST_STEPS, ceiling)
+        fit = followed(base, model, values, ceiling)
         if fit is None:
             continue
         same = best is not None and abs(fit.point.objective - best.point.objective) < ONE_PLACE
@@ -286,13 +283,13 @@ def refit_without(fit: Fit, candidate: Candidate, declared: Fit) -> Fit | None:
     needed is then beyond doubt, and others that replace it have to do better than it does.
     """
     model, ceiling = candidate.remove_from(fit.model, declared.model), ceiling_beside(fit)
-    found = followed(fit, model, {}, ceiling=ceiling)
+    found = followed(fit, model, {}, ceiling)
     nested = None
     with suppress(EstimationError):
         nested = declared.reweighed(fit.noise, fit.problem.priors)
     if nested and (found is None or found.point.objective > nested.point.objective):
         values = {name: fit.value(name) for name in fit.model.names}
-        other = followed(nested, model, values, ceiling=ceiling)
+        other = followed(nested, model, values, ceiling)
         both = [x for x in (found, other) if x is not None]
         found = min(both, key=lambda x: x.point.objective, default=None)
     return found
@@ -349,7 +346,7 @@ def _confirm_load(base: Fit, best: Confirmed, screened: Screened) -> Confirmed |
     values = load_instead(best.fit, best.candidate, screened.candidate)
     without = best.candidate.remove_from(best.fit.model, base.model)
     larger, ceiling = screened.candidate.add_to(without), ceiling_beside(best.fit)
-    fit = followed(best.fit, larger, values, MOST_STEPS, ceiling)
+    fit = followed(best.fit, larger, values, ceiling)
     with suppress(EstimationError):
         found = Confirmed.of(screened, base, fit, best.beside)
         if found and found.fit.log_evidence > best.fit.log_evidence - EVIDENCE_APART:

@@ -10,6 +10,7 @@ from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.effects import CableData, RestCurvatureDrift
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.estimation.descent import NEARLY
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.result import Fit
@@ -65,7 +66,7 @@ def test_a_left_out_pose_is_that_of_a_fit_without_it(k):
     expected = (poses[k].distances(seen.curve) ** 2).sum()
     again = fit.problem.unknowns.p(crossval._fitted_without(fit, k))
     # A decrease of the objective by the tolerance is a step of sqrt(2 x tolerance) std.
-    apart = np.sqrt(2 * crossval.REFIT_TOLERANCE) * known.std("bending_stiffness")
+    apart = np.sqrt(2 * NEARLY) * known.std("bending_stiffness")
     np.testing.assert_allclose(again, known.p, atol=apart)
     assert cross_validate(fit).squares[k] == pytest.approx(expected, rel=1e-2)
 
