@@ -37,7 +37,6 @@ from dlo_casadi.runtime.work import Bound, accounted_as
 from dlo_casadi.thresholds import (
     EVIDENCE_APART,
     LEAST_PROMISED,
-    LEAST_PROMISED_BY_TWO,
     SIGNIFICANCE,
 )
 
@@ -224,14 +223,13 @@ class Search:
         return found, force
 
     def may_gain(self, scattering: Fit) -> bool:
-        """Whether one or two scores promise a fair share of what the scatter gains."""
-        gained = 2 * (scattering.log_evidence - self.declared.log_evidence)
-        least, by_two = LEAST_PROMISED * gained, LEAST_PROMISED_BY_TWO * gained
-        if not self.declared.converged or any(item.score > least for item in self.trials.first):
+        """Whether an effect and a second one beside it promise what the scatter gains, nearly."""
+        if not self.declared.converged:
             return True
+        least = 2 * LEAST_PROMISED * (scattering.log_evidence - self.declared.log_evidence)
         refitted = self.trials.tried(self.declared, largest=min(2, self.max_effects)).refits
         best = sorted(refitted, key=lambda item: -item.gain)[:1]
-        return any(x.gain + y.score > by_two for x in best for y in self.trials.screened(x.fit))
+        return any(x.gain + y.score > least for x in best for y in self.trials.screened(x.fit))
 
     @accounted_as("searches")
     def run(self) -> Found:

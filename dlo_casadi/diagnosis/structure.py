@@ -20,7 +20,7 @@ from dlo_casadi.thresholds import (
     COLLINEAR,
     KEPT_VARIANCE,
     LEAST_NOISE_DEGREES,
-    REPEATS,
+    UNSEEN,
 )
 
 # Smallest tail probability of a test: smaller ones carry no more information.
@@ -188,7 +188,7 @@ def limiting_spread(fit: Fit) -> float | None:
     if spread is None or fit.noise.source == "repeats":
         return spread
     floor = noise_distance(fit.problem.history, fit.noise.std)
-    return spread if spread > REPEATS * floor else None
+    return spread if spread > UNSEEN * floor else None
 
 
 def alike(fit: Fit) -> list[tuple[str, ...]]:

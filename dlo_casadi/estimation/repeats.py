@@ -13,7 +13,7 @@ from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.sensing.noise_estimate import NoiseSample, estimate_noise, tell_of_noise
-from dlo_casadi.thresholds import DIFFERENT, REPEATS_ARE_NOISE
+from dlo_casadi.thresholds import DIFFERENT, UNSEEN
 
 # Share of the length beside each fixture that is left out: repeats agree where they are held.
 _BESIDE_FIXTURES = 0.02
@@ -116,7 +116,7 @@ def with_repeats(
     if enough_poses(measured, model):
         return noise  # differences between repeats are then modelled by `pose_scatter`
     spread = repeatability(measured, model)
-    if spread is None or spread <= REPEATS_ARE_NOISE * noise.std:
+    if spread is None or spread <= UNSEEN * noise.std:
         return noise
     samples, groups, length = [], _groups(measured, model), model.cable.length
     nodes = np.linspace(0.0, length, _NODES)
@@ -140,7 +140,7 @@ def with_repeats(
     if not tell_of_noise(samples):
         return noise
     found = estimate_noise(samples, length)
-    if found.std <= REPEATS_ARE_NOISE * noise.std:
+    if found.std <= UNSEEN * noise.std:
         return noise
     # Of m distances from their mean, m - 1 are independent.
     free = 1 - len(groups) / sum(map(len, groups))

@@ -23,7 +23,7 @@ from dlo_casadi.model.pose_scatter import MODES, PoseScatter, sources_in
 from dlo_casadi.rod.quantities import FORCE, MOMENT, QUANTITIES
 from dlo_casadi.sensing.noise import NoiseModel, ReadingNoise, smooth_modes
 from dlo_casadi.sensing.noise_estimate import NoiseSample, estimate_noise, tell_of_noise
-from dlo_casadi.thresholds import NOTABLE, SCATTER_APART, SCATTERED_DEGREES
+from dlo_casadi.thresholds import EVIDENCE_APART, NOTABLE, SCATTERED_DEGREES
 
 # Number of slow displacements per pose kept out of the noise estimate: many while an effect may be
 # missing, few once the model is taken as complete, because noise is also slow.
@@ -226,7 +226,7 @@ def pose_scatter_of(fit: Fit, noise: NoiseModel) -> ScatterEstimate:
         return found
     others = _scatters_of(fit, noise, [PoseScatter(source=x) for x in sources_in(fit.model)])
     best, *others = sorted((found, *others), key=lambda item: item.deviance)
-    near = [x.scatter for x in others if x.deviance < best.deviance + SCATTER_APART]
+    near = [x.scatter for x in others if x.deviance < best.deviance + 2 * EVIDENCE_APART]
     alike = tuple(one for one in near if one.std > 0)
     return replace(best, scatter=replace(best.scatter, rivals=alike))
 
