@@ -16,6 +16,7 @@ from dlo_casadi.diagnosis.from_pose_to_pose import (
     bends_at_random,
     with_loose_poses,
 )
+from dlo_casadi.diagnosis.gram import sidak, survival
 from dlo_casadi.diagnosis.if_hidden import IfHidden, if_hidden
 from dlo_casadi.diagnosis.selection import (
     AddedEffect,
@@ -298,8 +299,20 @@ def _repeating(search: Search, _: Found | None = None) -> Search:
 
 
 def _noise_is_smaller(search: Search, found: Found) -> bool:
-    """Whether the noise of a complete model is smaller than the first estimate, which is rough."""
-    return not found.added and found.fit.noise.std < search.declared.noise.std
+    """Whether scores may be significant under the noise of a complete model.
+
+    The first estimate of it is rough. To first order, scores grow as the noise's variance, or that
+    of its correlated part, falls.
+    """
+    if found.added or found.fit.noise.std >= search.declared.noise.std:
+        return False
+    before, now = search.declared.noise, found.fit.noise
+    slow = before.share * before.length / max(now.share * now.length, 1e-300)
+    growth, dof = max(1.0, slow) * (before.std / now.std) ** 2, screening_degrees(found.fit)
+    first = search.trials.first
+    p_values = (survival(growth * x.score, max(len(x.candidate.screened), 1), dof) for x in first)
+    likely = any(sidak(p, len(first)) < search.trials.significance for p in p_values)
+    return found.fit.scatters or likely
 
 
 def _under_its_noise(search: Search, found: Found | None) -> Search:

@@ -101,12 +101,18 @@ def _moved_together(listed: Sequence[Candidate], k: int) -> list[list[Candidate]
 
 # Whitened columns (R_j, q) of each pose, by the label of the candidate and its scan.
 Columns = dict[Place, list[FloatArray]]
+# Candidates that move together, by their labels.
+Together = dict[tuple[str, ...], _Moving]
 
 
-def _columns(fit: Fit, listed: Sequence[Candidate], scans: Sequence[int]) -> Columns:
-    """The columns of all candidates at their scans; of a nuisance those of the fit."""
+def _columns(
+    fit: Fit, listed: Sequence[Candidate], scans: Sequence[int], moving: Together
+) -> Columns:
+    """The columns of all candidates at their scans; of a nuisance those of the fit.
+
+    `moving`: those known from other scans; new ones are added.
+    """
     names, lin = fit.problem.unknowns.names, fit.linearization
-    moving: dict[tuple[str, ...], _Moving] = {}
     found: Columns = {}
     for k in scans:
         for nuisance in (c for c in listed if c.nuisance and k == 0):
@@ -131,6 +137,7 @@ class Screen:
         self.fit = fit
         self.listed = list(listed)
         self.unknowns = fit.problem_in(extended(fit, listed)).unknowns
+        self.moving: Together = {}
 
     def run(self, noise_dof: float, executor: Executor | None = None) -> list[Screened]:
         """Score all candidates, best first; the arguments are those of `gram`."""
@@ -158,8 +165,9 @@ class Screen:
         """Columns at scans; these are split into one part per worker."""
         workers = max(1, min(workers_of(executor), len(scans)))
         parts = [scans[i::workers] for i in range(workers)]
-        begun = [begin(executor, _columns, self.fit, self.listed, part) for part in parts[1:]]
-        found = [_columns(self.fit, self.listed, parts[0]), *(wait() for wait in begun)]
+        given = self.fit, self.listed
+        begun = [begin(executor, _columns, *given, part, Together()) for part in parts[1:]]
+        found = [_columns(*given, parts[0], self.moving), *(wait() for wait in begun)]
         return {place: columns for part in found for place, columns in part.items()}
 
     def _gram(self, mixed: LinearMixed, columns: Columns, noise_dof: float) -> Gram:

@@ -281,8 +281,10 @@ def carried_shapes(problem: Problem, fit: Fit, *, relaxed: bool = False) -> Shap
         pose = problem.history[index].pose
         deviation = np.zeros_like(own.deviation[0])
         try:
-            before = (problem.history[index - 1].pose, rows[-1][0]) if rows else None
-            found = solve_after(fit.model, fit.p, fit.rest, pose, before)
+            if index not in fit.beside:
+                before = (problem.history[index - 1].pose, rows[-1][0]) if rows else None
+                fit.beside[index] = solve_after(fit.model, fit.p, fit.rest, pose, before)
+            found = fit.beside[index]
             rows.append((found.x, found.multipliers, deviation, found.near))
         except EquilibriumError as error:
             if not relaxed:

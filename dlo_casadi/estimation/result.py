@@ -12,6 +12,7 @@ import numpy as np
 
 from dlo_casadi.arrays import BoolArray, Brief, FloatArray
 from dlo_casadi.effects.mass_error import MASS_FACTOR
+from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.estimation.problem import FIRST_ROUGHNESS, Priors, Problem
 from dlo_casadi.estimation.unknowns import REST_TURNS_STD, Linearization, Point, Unknowns
 from dlo_casadi.linear_mixed import NO_INFORMATION, LinearMixed, Normal
@@ -112,6 +113,11 @@ class Fit(Brief):
     def mixed(self) -> LinearMixed:
         """The fit to first order about the minimum."""
         return self.problem.mixed(self.point, self.linearization)
+
+    @cached_property
+    def beside(self) -> dict[int, Equilibrium]:
+        """Equilibria of poses that the fit did not need, by their index, as they were asked for."""
+        return {}
 
     @property
     def normal(self) -> Normal:
