@@ -26,11 +26,8 @@ from dlo_casadi.estimation.constrained import threshold
 from dlo_casadi.estimation.descent import refit
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.cable_model import STIFFNESSES
-from dlo_casadi.thresholds import NORMAL_95
+from dlo_casadi.thresholds import ALIKE, NORMAL_95
 
-# Share of the widest interval (of its logarithm) from which on a candidate with fewer parameters
-# stands for one with more: of a force, a weight and a tether at one place the weight is named.
-NEARLY_AS_WIDE = 0.9
 # Largest factor by which the refit moves an end, of its logarithm; it was 1.5 in markers_in_space.
 # Measured in 13 plane sessions: intervals 4.5 times as wide as `interval_95` (median), 3.0 without.
 FARTHEST = 2.0
@@ -83,7 +80,7 @@ def _widest(fit: Fit, name: str, rows: Sequence[Widened]) -> IfHidden:
     spread = np.sqrt(threshold(fit, name)) / NORMAL_95
     ends = [row.ends(name, spread) for row in rows]
     width = [high - low for low, high in ends]
-    wide = [i for i, each in enumerate(width) if each >= NEARLY_AS_WIDE * max(width)]
+    wide = [i for i, each in enumerate(width) if each >= ALIKE * max(width)]
     best = min(wide, key=lambda i: (len(rows[i].candidate.screened), -width[i]))
     row, value = rows[best], fit.value(name)
     far = max(ends[best], key=abs)

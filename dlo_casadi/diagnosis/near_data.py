@@ -36,12 +36,8 @@ from dlo_casadi.estimation.fit import EXPLAINED, explains, misfits
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.runtime.work import UNBOUNDED, Bound, accounted_as
-from dlo_casadi.thresholds import REFITTED
+from dlo_casadi.thresholds import BEST, REFITTED
 
-# Number of subsets of each size started at the measured shapes, of each point of linearisation. Of
-# 40 sessions with hidden effects the true subset was among the best 3 of its size at the declared
-# fit in 37, at the relaxed one in 37, at either in all.
-BEST = 3
 # Largest number of candidates found at once.
 LARGEST = 3
 # Ratio of what two starts leave, or of what one leaves to the noise, within which they are close.

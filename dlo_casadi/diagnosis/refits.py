@@ -43,13 +43,8 @@ from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.thresholds import EVIDENCE_APART
 
-# Shares of the one-step estimate from which a refit is tried, in this order.
+# Shares of the one-step estimate from which a refit is tried, in this order, until one gains.
 SHARES = (1.0, 0.5, 0.2, 0.05)
-# Share of the gain predicted by the score above which a slowly converging refit is not repeated.
-PROMISED = 0.5
-# Refits whose objectives differ by less have reached the same minimum: no smaller share is tried.
-# Without this limit the reports of eighteen sessions were the same.
-ONE_PLACE = 1.0
 # A refit is given up if its minimum is predicted above that of a known one by more than this (ten
 # times the log likelihood by which a rival may fall short) and by more than the known minimum.
 GIVEN_UP = 10 * EVIDENCE_APART
@@ -246,22 +241,15 @@ def refit_with(base: Fit, *each: Screened, ceiling: float = np.inf) -> Fit | Non
     linear = {name for x in each for name in x.candidate.screened}
     start = {name: value for x in each for name, value in x.start.items()}
     best: Fit | None = None
-    hopeless = 0
     for share in SHARES:
         values = {
             name: begin[name] + (share if name in linear else 1.0) * (value - begin[name])
             for name, value in start.items()
         }
         fit = followed(base, model, values, ceiling)
-        if fit is None:
-            continue
-        same = best is not None and abs(fit.point.objective - best.point.objective) < ONE_PLACE
-        if best is None or fit.point.objective < best.point.objective:
+        if fit is not None and (best is None or fit.point.objective < best.point.objective):
             best = fit
-        gain = 2 * (base.point.objective - best.point.objective)
-        hopeless += fit.point.objective > ceiling
-        kept = gain > 0 and (best.converged or gain > PROMISED * each[-1].score)
-        if same or hopeless == 2 or kept:
+        if best is not None and best.point.objective < base.point.objective:
             break
     return best
 

@@ -19,7 +19,7 @@ from dlo_casadi.diagnosis.candidates import Candidate, candidates_of
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.from_data import from_data
 from dlo_casadi.diagnosis.gram import Gram, Screened, p_values_of, sidak, survival
-from dlo_casadi.diagnosis.near_data import BEST, near_data
+from dlo_casadi.diagnosis.near_data import near_data
 from dlo_casadi.diagnosis.refits import Confirmed, Tried
 from dlo_casadi.diagnosis.selection import (
     AddedEffect,
@@ -35,7 +35,7 @@ from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.variances import SETTLED_MODES, settle
 from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.runtime.work import UNBOUNDED, Bound, accounted_as
-from dlo_casadi.thresholds import DIFFERENT, REFITTED, WORTH
+from dlo_casadi.thresholds import BEST, DIFFERENT, REFITTED, WORTH
 
 
 @dataclass(frozen=True)

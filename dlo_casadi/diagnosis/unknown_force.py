@@ -21,13 +21,9 @@ from dlo_casadi.estimation.unknowns import Unknowns, Values
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.runtime.work import accounted_as
-from dlo_casadi.thresholds import NORMAL_95
+from dlo_casadi.thresholds import BEST, NORMAL_95
 
-# Number of places that remain after the scan and get a full fit.
-TRIED = 3
 PLACES = tuple(float(share) for share in np.linspace(0.1, 0.9, 9))
-# Standard deviation of a force about the mean of the poses, in weights of the cable.
-FORCE_WEIGHTS = 1.0
 # Maximum number of Gauss-Newton steps in the flat valley of stiffness against force.
 MOST_STEPS = 150
 
@@ -113,7 +109,7 @@ class _Search:
         _, begun = begin(problem, theta)
         starts = map_in_order(executor, partial(self.relaxed_at, begun), PLACES)
         likely = sorted(starts, key=lambda start: start[0])
-        fits = map_in_order(executor, self.fit_from, [start[1:] for start in likely[:TRIED]])
+        fits = map_in_order(executor, self.fit_from, [start[1:] for start in likely[:BEST]])
         return sorted((fit for fit in fits if fit), key=lambda fit: fit.point.objective)
 
     def relaxed_at(self, begun: Values, share: float) -> tuple[float, float, Values]:
@@ -141,7 +137,7 @@ class _Search:
         return self._problem(Unknowns(self.model, free, values))
 
     def _problem(self, unknowns: Unknowns) -> Problem:
-        """Problem with the base's scatter of ends, and with a std of the force about its mean.
+        """Problem with the base's scatter of ends; the weight is the std of a force about its mean.
 
         Shapes determine the ratio of forces to stiffness; only the weight determines their size. If
         the weight hardly shows, a force of a hundred times the weight would fit as well. A force
@@ -150,7 +146,7 @@ class _Search:
         problem, model = self.base.problem, self.model
         scatter, cable = problem.priors.scatter.copy(), model.cable
         bending = cable.bending_stiffness / cable.length**2
-        scatter[_columns(model)] = FORCE_WEIGHTS * max(model.weight, bending)
+        scatter[_columns(model)] = max(model.weight, bending)
         return replace(problem, unknowns=unknowns, priors=replace(problem.priors, scatter=scatter))
 
 
