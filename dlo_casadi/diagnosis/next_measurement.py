@@ -18,10 +18,9 @@ from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.rod.quantities import quantity_of
 from dlo_casadi.thresholds import NOTABLE
 
-# Number of trial directions of the clamp for a pose that would separate two models.
-HEADINGS = 12
-# Number of trial end poses, drawn within the region that the session has explored.
-TRIED = 30
+# Number of trial poses that may separate two models: directions of the clamp, or end poses drawn
+# within the region that the session has explored.
+TRIED = 16
 SEED = 0
 # Largest number of repeats that is proposed.
 MOST_REPEATS = 20
@@ -68,7 +67,7 @@ def _pose_that_tells(fit: Fit, other: Fit) -> tuple[float | None, float | None]:
         return None, None
     base = fit.problem.fit_poses[0].pose
     places = np.linspace(0.0, fit.model.cable.length, 51)
-    headings, differences = np.linspace(-np.pi, np.pi, HEADINGS, endpoint=False), []
+    headings, differences = np.linspace(-np.pi, np.pi, TRIED, endpoint=False), []
     poses = [replace(base, start_heading=float(x), branch=None) for x in headings]
     shapes = (predict_each(one.model, one.p, one.rest_now, poses) for one in (fit, other))
     for pair in zip(*shapes, strict=True):

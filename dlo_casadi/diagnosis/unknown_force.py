@@ -24,8 +24,6 @@ from dlo_casadi.runtime.work import accounted_as
 from dlo_casadi.thresholds import BEST, NORMAL_95
 
 PLACES = tuple(float(share) for share in np.linspace(0.1, 0.9, 9))
-# Maximum number of Gauss-Newton steps in the flat valley of stiffness against force.
-MOST_STEPS = 150
 
 
 @dataclass(frozen=True)
@@ -72,7 +70,7 @@ def estimate_unknown_force(base: Fit, executor: Executor) -> UnknownForce | None
     best: Fit | None = None
     for fit in search.run(executor):
         with suppress(EstimationError):
-            best = refit(fit, model, steps=MOST_STEPS)
+            best = refit(fit, model)
             break
     if best is None:
         return None
@@ -126,7 +124,7 @@ class _Search:
             return None
         moving = self._problem(Unknowns(self.model, self.base.free_in(self.model), held.p))
         theta = moving.unknowns.pack(held.p, held.coefficients)
-        return descend(Fit(moving, replace(held.point, theta=theta)), MOST_STEPS)
+        return descend(Fit(moving, replace(held.point, theta=theta)))
 
     def held_at(self, share: float) -> Problem:
         """Problem with the load at a share of the length, all else nominal or kept fixed."""

@@ -267,14 +267,14 @@ class _Estimate:
     noise: NoiseModel
     deviance: float
     log_slow: float  # logarithm of that variance, relative to the other estimates
-    log_slow_variance: float  # variance of that logarithm
+    spread: Callable[[], float]  # computes the variance of that logarithm
 
 
 def _white(samples: list[NoiseSample], cable_length: float) -> _Estimate:
     found = restricted_deviance(NoiseModel(1.0), samples)
     noise = NoiseModel(found.std)
     log_slow = _log_slow(noise, samples, cable_length)
-    return _Estimate(noise, found.value, log_slow, 2 / _degrees(samples))
+    return _Estimate(noise, found.value, log_slow, lambda: 2 / _degrees(samples))
 
 
 def _correlated(samples: list[NoiseSample], cable_length: float, kernel: Kernel) -> _Estimate:
@@ -296,18 +296,20 @@ def _correlated(samples: list[NoiseSample], cable_length: float, kernel: Kernel)
         noise = replace(unit(at), std=found.std)
         return _log_slow(noise, samples, cable_length), found.gradient + _BEYOND * (q - at)
 
+    def spread() -> float:
+        steps = _STEP * np.eye(2)
+        ahead, behind = ([beside(q + way * step) for step in steps] for way in (1, -1))
+        slope, bend = (
+            np.array([a[k] - b[k] for a, b in zip(ahead, behind, strict=True)]) / (2 * _STEP)
+            for k in (0, 1)
+        )
+        # The covariance is twice the inverse Hessian of -2 log likelihood; at least the prior's.
+        values, vectors = np.linalg.eigh((bend + bend.T) / 2)
+        along = vectors.T @ slope
+        return 2 / _degrees(samples) + 2 * float((along**2 / np.maximum(values, 0.04)).sum())
+
     q, found = most_likely(deviance, _START, *_LIMITS)
     noise = replace(unit(q), std=found.std)
-    steps = _STEP * np.eye(2)
-    ahead, behind = ([beside(q + way * step) for step in steps] for way in (1, -1))
-    slope, bend = (
-        np.array([a[k] - b[k] for a, b in zip(ahead, behind, strict=True)]) / (2 * _STEP)
-        for k in (0, 1)
-    )
-    # The covariance is twice the inverse Hessian of -2 log likelihood; at least the prior's.
-    values, vectors = np.linalg.eigh((bend + bend.T) / 2)
-    along = vectors.T @ slope
-    spread = 2 / _degrees(samples) + 2 * float((along**2 / np.maximum(values, 0.04)).sum())
     return _Estimate(noise, found.value, _log_slow(noise, samples, cable_length), spread)
 
 
@@ -344,6 +346,6 @@ def _slow_dof(found: list[_Estimate]) -> float:
     weight = np.exp(-(deviance - deviance.min()) / 2)
     weight /= weight.sum()
     mean = np.array([item.log_slow for item in found])
-    within = np.array([item.log_slow_variance for item in found])
+    within = np.array([item.spread() for item in found])
     variance = float(weight @ (within + (mean - weight @ mean) ** 2))
     return 2 / variance

@@ -364,7 +364,7 @@ def test_how_well_slow_modes_are_known_is_that_of_their_likelihood():
     weights = np.exp(np.array(logs) - max(logs))
     variance = np.cov(slow, aweights=weights, ddof=0)
     size = 2 / (12 * (60 - 4))  # of the noise itself, with 4 of 60 directions projected out
-    assert found.log_slow_variance == pytest.approx(variance + size, rel=0.1)
+    assert found.spread() == pytest.approx(variance + size, rel=0.1)
 
 
 def test_how_well_slow_modes_are_known_is_known():
