@@ -20,7 +20,7 @@ from dlo_casadi.thresholds import NOTABLE
 
 # Number of trial poses that may separate two models: directions of the clamp, or end poses drawn
 # within the region that the session has explored.
-TRIED = 16
+TRIED = 12
 SEED = 0
 # Largest number of repeats that is proposed.
 MOST_REPEATS = 20
