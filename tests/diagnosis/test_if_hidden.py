@@ -1,8 +1,7 @@
 """What one effect that is too small to show would do to a stiffness."""
 
-from types import SimpleNamespace
-
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
