@@ -34,7 +34,7 @@ from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.runtime.parallel import begin, workers_of
-from dlo_casadi.thresholds import IN_QUESTION, SCANS_PER_TEST
+from dlo_casadi.thresholds import IN_QUESTION, SCANS_APART
 
 
 def extended(fit: Fit, listed: Sequence[Candidate]) -> CableModel:
@@ -144,13 +144,13 @@ class Screen:
         return self.gram(noise_dof, executor).singles
 
     def gram(self, noise_dof: float, executor: Executor | None = None) -> Gram:
-        """Scores of all candidates at every third place, and next to the best of likely ones.
+        """Scores of all candidates at every second place, and next to the best of likely ones.
 
         `noise_dof`: degrees of freedom of the noise estimate; inf where it is declared. `executor`:
         runs the scans; in this process by default.
         """
         n_scans = max(len(candidate.scans) for candidate in self.listed)
-        first = range(0, n_scans, SCANS_PER_TEST)
+        first = range(0, n_scans, SCANS_APART)
         columns = self._scanned(first, executor or InProcess())
         found = self._gram(self.fit.mixed, columns, noise_dof)
         likely = [x for x in found.singles if x.p_value < IN_QUESTION]
@@ -195,21 +195,19 @@ class RelaxedScreen(Screen):
         self.softness = softness
 
     def gram(self, noise_dof: float, executor: Executor | None = None) -> Gram:
-        """Scores at every third place, with each pose's own unknowns eliminated."""
+        """Scores at every second place, with each pose's own unknowns eliminated."""
         whole = _Moving.of(self.fit, self.listed, relaxed=True)
         further: list[Further] = []
         asked = [(c, 0) for c in self.listed]
         for of_states in (False, True):
             group = [c for c in self.listed if isinstance(c.effect, StateEffect) == of_states]
             n_scans = max((len(c.scans) for c in group), default=1)
-            moving = (
-                _Moving.of(self.fit, group, relaxed=True) if n_scans > SCANS_PER_TEST else whole
-            )
+            moving = _Moving.of(self.fit, group, relaxed=True) if n_scans > SCANS_APART else whole
             relaxation, names = (
                 Relaxation(moving.problem, self.softness),
                 moving.problem.unknowns.names,
             )
-            for k in range(SCANS_PER_TEST, n_scans, SCANS_PER_TEST):
+            for k in range(SCANS_APART, n_scans, SCANS_APART):
                 kept = [c for c in group if k < len(c.scans)]
                 columns = [names.index(name) for c in kept for name in c.screened]
                 further.append((relaxation, moving.at(_scan(group, k)), columns))

@@ -9,6 +9,8 @@ from dlo_casadi.effects.effect import Load, Params
 
 # Qualified name of its parameter.
 MASS_FACTOR = "mass_error.factor"
+# Largest factor by which a mass may be wrong.
+MOST_HEAVY = 5.0
 
 
 class MassError(Load):
@@ -28,7 +30,9 @@ class MassError(Load):
     name = "mass_error"
     lasts = True
     corrects = "mass"
-    declared = (Parameter("factor", nominal=1.0, scale=0.1, lower=0.2, upper=5.0),)
+    declared = (
+        Parameter("factor", nominal=1.0, scale=0.1, lower=1 / MOST_HEAVY, upper=MOST_HEAVY),
+    )
 
     @classmethod
     def applies(cls, setup: Setup) -> bool:

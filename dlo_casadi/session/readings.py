@@ -12,7 +12,7 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config import Config, Pose
-from dlo_casadi.effects.mass_error import MassError
+from dlo_casadi.effects.mass_error import MOST_HEAVY
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.prediction import predict_each
 from dlo_casadi.estimation.result import Fit
@@ -221,8 +221,7 @@ def _other_unit(name: str, scale: float, beside: str, *, told: bool = False) -> 
 
     `told`: `beside` is a reading, whose unit may as well be the wrong one.
     """
-    (factor,) = MassError.declared  # a wrong mass scales the shapes' forces
-    if factor.lower < scale < factor.upper:
+    if 1 / MOST_HEAVY < scale < MOST_HEAVY:  # a wrong mass scales the forces that shapes need
         return
     cures, pairs = [], [("", name, scale), (f"{beside} ", beside, 1 / scale)]
     for whose, one, factor in pairs[: 1 + told]:

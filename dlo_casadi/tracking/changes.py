@@ -35,7 +35,7 @@ from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.linear_mixed import Score
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import STIFFNESSES, CableModel
-from dlo_casadi.thresholds import COLLINEAR, SCANS_PER_TEST
+from dlo_casadi.thresholds import COLLINEAR, SCANS_APART
 from dlo_casadi.tracking.known import coefficient
 from dlo_casadi.tracking.seen import Seen
 from dlo_casadi.tracking.shaper import declared
@@ -205,7 +205,7 @@ class Probe:
         """All suspects, each at every other place of the diagnosis."""
         listed = new_candidates(model)
         out = []
-        for k in range(0, max((len(one.scans) for one in listed), default=1), SCANS_PER_TEST):
+        for k in range(0, max((len(one.scans) for one in listed), default=1), SCANS_APART):
             chosen = [(one, one.scans[k]) for one in listed if k < len(one.scans)]
             out.append(cls._of(model, unknown, chosen, own=k == 0))
         return out
