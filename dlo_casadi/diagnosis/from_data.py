@@ -33,8 +33,9 @@ from dlo_casadi.model.cable_model import END_ROLL, CableModel
 from dlo_casadi.runtime.work import accounted_as
 from dlo_casadi.sensing.noise import NoiseModel
 
-# Softness [rad] at which candidates may be scored.
-SCORED = (1e-1, 3e-2, 1e-2)
+# Softness [rad] at which candidates may be scored; largest sum of squares per residual at which
+# relaxed shapes still count as the measured ones.
+SCORED, MEASURED = (1e-1, 3e-2, 1e-2), 2.0
 # Softness [rad] through which candidates are relaxed before they are compared; largest objective of
 # a candidate relative to the least one where that is noise: differences are then twice those of log
 # likelihoods, a tenth of hundreds is beyond doubt. A soft balance is less informative for a
@@ -87,7 +88,7 @@ def _from_data_on(base: Fit, mesh: int) -> tuple[Fit, float]:
     for softness in SCORED:
         values = Relaxation(problem, softness).solve(values)
         near = Fit(problem, problem.evaluate(values))
-        if best is not None and near.point.data > EXPLAINED * problem.n_residuals:
+        if best is not None and near.point.data > MEASURED * problem.n_residuals:
             break
         best = near, softness
     assert best is not None

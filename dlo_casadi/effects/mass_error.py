@@ -10,7 +10,7 @@ from dlo_casadi.effects.effect import Load, Params
 # Qualified name of its parameter.
 MASS_FACTOR = "mass_error.factor"
 # Largest factor by which a mass may be wrong.
-MOST_HEAVY = 5.0
+HEAVIEST = 5.0
 
 
 class MassError(Load):
@@ -30,9 +30,7 @@ class MassError(Load):
     name = "mass_error"
     lasts = True
     corrects = "mass"
-    declared = (
-        Parameter("factor", nominal=1.0, scale=0.1, lower=1 / MOST_HEAVY, upper=MOST_HEAVY),
-    )
+    declared = (Parameter("factor", nominal=1.0, scale=0.1, lower=1 / HEAVIEST, upper=HEAVIEST),)
 
     @classmethod
     def applies(cls, setup: Setup) -> bool:

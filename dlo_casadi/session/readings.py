@@ -12,7 +12,7 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config import Config, Pose
-from dlo_casadi.effects.mass_error import MOST_HEAVY
+from dlo_casadi.effects.mass_error import HEAVIEST
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.prediction import predict_each
 from dlo_casadi.estimation.result import Fit
@@ -221,7 +221,7 @@ def _other_unit(name: str, scale: float, beside: str, *, told: bool = False) -> 
 
     `told`: `beside` is a reading, whose unit may as well be the wrong one.
     """
-    if 1 / MOST_HEAVY < scale < MOST_HEAVY:  # a wrong mass scales the forces that shapes need
+    if 1 / HEAVIEST < scale < HEAVIEST:  # a wrong mass scales the forces that shapes need
         return
     cures, pairs = [], [("", name, scale), (f"{beside} ", beside, 1 / scale)]
     for whose, one, factor in pairs[: 1 + told]:
