@@ -109,12 +109,12 @@ LACKING_SHARE = 0.25
 
 # ---- contradictions of the configuration -------------------------------------------------------
 
-# Misfit of a line's ends or length, in lengths of the cable, below which they fit; beyond twice it
+# Misfit of a line's ends or length, in lengths of the cable, below which they fit; and beyond which
 # they contradict what was declared: lines end up to 0.08 from their fixtures where a holder or a
 # gap hides the cable. Medians of 32 sessions are no more than 0.003 shorter than the cable; one
-# line of a photograph is 0.04 shorter. Half of it is room between neighbouring markers for five
-# times a noise of 3 mm of both on a cable of 1 m.
-FITS = 0.05
+# line of a photograph is 0.04 shorter. Half of the first is room between neighbouring markers for
+# five times a noise of 3 mm of both on a cable of 1 m.
+FITS, CONTRADICTS = 0.04, 0.1
 # Largest share of a misfit that an explanation may leave; largest share of readings that what
 # explains them may leave. Simulated cables with rest curvatures of 1 1/m leave 0.05 (plane) and
 # 0.15 (space) of readings without shapes, with another sign, unit or frame 0.7 and more; softening

@@ -16,7 +16,7 @@ from dlo_casadi.rod.node import Node
 from dlo_casadi.session.outcome import PoseInput
 from dlo_casadi.session.questions import Suspicion
 from dlo_casadi.session.read_session import ReadSession
-from dlo_casadi.thresholds import FITS, HEADING_OFF, NEARLY_ALL
+from dlo_casadi.thresholds import CONTRADICTS, FITS, HEADING_OFF, NEARLY_ALL
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def _far_off(own: Sequence[_Passed], length: float) -> list[Suspicion]:
     typical = float(np.median(gaps))
     said = f"{own[0].clip.name} is {typical:.3g} m from the measured lines (median)"
     text = f"{said}. Try: its places, in metres and in the frame of the points."
-    return [Suspicion(text, typical > 2 * FITS * length)]
+    return [Suspicion(text, typical > CONTRADICTS * length)]
 
 
 def _of_other_kind(own: Sequence[_Passed], length: float) -> list[Suspicion]:

@@ -13,7 +13,7 @@ from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.fitting import declared_model
 from dlo_casadi.session.read_session import ReadSession, spread
-from dlo_casadi.thresholds import FITS, UNEXPLAINED
+from dlo_casadi.thresholds import CONTRADICTS, UNEXPLAINED
 
 # Per comparison: poses; elements of the mesh, points of a line, rest curvature coefficients.
 POSES = 8
@@ -75,7 +75,7 @@ def coarse_fit(session: ReadSession, most: int = POSES) -> Coarse:
             refined=False,
         )
     except EstimationError:
-        return Coarse(None, 2 * FITS * length, False)
+        return Coarse(None, CONTRADICTS * length, False)
     sized = bool(fit.std(BENDING_STIFFNESS) < _SIZED * fit.value(BENDING_STIFFNESS))
     weight = sized or not any(model.gravity)
     return Coarse(fit, fit.residual_rms, weight, sized, _correlation(fit))

@@ -23,6 +23,7 @@ from dlo_casadi.session.mistakes import (
 from dlo_casadi.session.questions import Alternatives, Suspicion
 from dlo_casadi.session.read_session import ReadSession
 from dlo_casadi.thresholds import (
+    CONTRADICTS,
     FITS,
     MUCH_BETTER,
     NEAR_UNIT,
@@ -53,7 +54,7 @@ _LENGTHS = Alternatives(
 )
 _SPANS = Alternatives(UNITS_OF_ENDS, _off_spans, enough=_FEW_OFF)
 _COUNTED = Alternatives(COUNTED, _off_fixtures, FITS, FITS, MUCH_BETTER)
-_FRAMES = Alternatives(FRAMES, _off_fixtures, 2 * FITS, FITS, MUCH_BETTER)
+_FRAMES = Alternatives(FRAMES, _off_fixtures, CONTRADICTS, FITS, MUCH_BETTER)
 _FITTED = Alternatives(FITTED_FRAMES, _off_fixtures, FITS, FITS, MUCH_BETTER, near=1.0)
 
 
@@ -61,7 +62,7 @@ def wrong_units(session: ReadSession) -> tuple[Suspicion, ...]:
     """Lengths, or distances of the ends, that are off by the factor of a unit."""
     lines = session.lines
     declared, measured = lines.spans
-    far = np.maximum(declared, measured) > 2 * FITS * lines.length
+    far = np.maximum(declared, measured) > CONTRADICTS * lines.length
     apart = np.isfinite(declared) & far
     whole = np.mean(lines.gaps.max(axis=1) < FITS * lines.length) >= NEARLY_ALL
     ends = [lines.of(apart)] * bool(apart.sum() > 1 and whole)
@@ -139,7 +140,7 @@ def single_poses(session: ReadSession) -> tuple[Suspicion, ...]:
             ),
         ),
         (
-            own > 2 * FITS,
+            own > CONTRADICTS,
             lambda i: (
                 f"its line runs from ({listed(lines.measured[i, 0])}) to "
                 f"({listed(lines.measured[i, 1])}) m, {own[i] * lines.length:.3g} m RMS away from "

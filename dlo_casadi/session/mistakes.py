@@ -18,7 +18,7 @@ from dlo_casadi.session.compared_readings import ComparedReading, Readings
 from dlo_casadi.session.compared_shapes import FittedSession
 from dlo_casadi.session.lines import Lines
 from dlo_casadi.session.questions import Mistake
-from dlo_casadi.thresholds import FITS, MUCH_BETTER
+from dlo_casadi.thresholds import CONTRADICTS, MUCH_BETTER
 
 # All ways to exchange and mirror axes in a plane and in space, but for the identity.
 AXES = tuple(axes for d in (2, 3) for axes in exchanges(d)[1:])
@@ -98,7 +98,7 @@ FRAMES: tuple[Mistake[Lines], ...] = (
     *(Mistake(_IN_FRAME, _in_axes(axes, moved=moved)) for moved in (False, True) for axes in AXES),
 )
 FITTED_FRAMES: tuple[Mistake[Lines], ...] = tuple(
-    Mistake(_IN_FRAME, _near_axes(axes), 2 * FITS) for d in (2, 3) for axes in exchanges(d)
+    Mistake(_IN_FRAME, _near_axes(axes), CONTRADICTS) for d in (2, 3) for axes in exchanges(d)
 )
 
 # ---- directions of clamps -----------------------------------------------------------------------
