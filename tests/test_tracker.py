@@ -144,6 +144,17 @@ def test_a_pose_seen_wrong_is_refused_and_three_are_a_change() -> None:
     assert tracker.params["lumped_mass.mass"].value < 0.001
 
 
+def test_refused_poses_before_an_alarm_are_of_the_change() -> None:
+    """The third odd pose, of a cable that hangs straight down, is too near to be refused."""
+    tracker, fallen = rope().tracker(STD), rope(load=0.0)
+    followed(tracker, rope())
+    seen = [tracker.update(pose(fallen, x, 70 + k)) for k, x in enumerate((-0.5, -0.3, -1.518))]
+    assert [one.refused for one in seen] == [True, True, False]
+    change = seen[-1].change
+    assert change is not None
+    assert (change.cause, change.since) == ("lumped_mass", len(HEADINGS) + 1)
+
+
 def changed(tracker: Tracker, cable: dlo.FittedCable, count: int) -> Change:
     """The change that was found when the cable is another one from now on."""
     for k in range(count):

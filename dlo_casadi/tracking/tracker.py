@@ -283,8 +283,12 @@ class Tracker:
 
     def _opened(self, since: int) -> Change:
         """An alarm: what changed is asked of the poses that are kept."""
-        run = self.count - self._refused if self._refused >= IN_A_ROW else self.count
-        poses = [one for one in self._window if not one.refused or one.number > run]
+        seen = [*self._window]
+        # Odd poses in a row are of the change, the last one of which need not have been refused.
+        accepted = [k for k, one in enumerate(seen[:-1]) if not one.refused]
+        first = accepted[-1] + 1 if accepted else 0
+        first = first if len(seen) - first >= IN_A_ROW else len(seen)
+        poses = [one for k, one in enumerate(seen) if k >= first or not one.refused]
         self._inquiry = Inquiry(
             poses, self._known, self.noise, self._faded, self._shaper, since, self.count
         )
