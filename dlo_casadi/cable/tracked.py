@@ -59,7 +59,8 @@ class TrackedCable(EstimatedCable):
             Standard deviation per pose of parameters that change slowly: {"bending_stiffness":
             1e-4}.
         compiled : bool
-            Whether equilibria are first found by compiled C; it takes some seconds to compile.
+            Whether equilibria and their derivatives are found by compiled C; it takes some seconds
+            to compile, in space up to a minute.
 
         Raises
         ------
