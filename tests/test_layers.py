@@ -52,7 +52,7 @@ MAY_IMPORT: dict[str, set[str]] = {
 }
 FITTING = {*MECHANICS, "sensing", "estimation", "diagnosis"}
 MAY_IMPORT["recordings"] = {"config", "vision", "io"}
-MAY_IMPORT["session"] = {*FITTING, "cable", "paper", "config", "io", "vision", "runtime"}
+MAY_IMPORT["session"] = {*FITTING, "motion", "cable", "paper", "config", "io", "vision", "runtime"}
 MAY_IMPORT["session"] |= {"export"}
 # A report reads results and solves nothing.
 MAY_IMPORT["report"] = {*MAY_IMPORT["session"], "session"} - {"equilibrium", "paper", "sensing"}

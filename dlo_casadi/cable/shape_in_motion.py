@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -10,16 +12,16 @@ from matplotlib.figure import Figure
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.estimate import EstimatedCable
 from dlo_casadi.cable.moving_picture import draw_modes
-from dlo_casadi.effects import MeasurementEffect
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError
-from dlo_casadi.motion.modes import DampedModes, damped_modes, displacements
-from dlo_casadi.motion.state import State
+from dlo_casadi.io.files import write_file
+from dlo_casadi.motion import modes_at_rest
+from dlo_casadi.motion.modes_at_rest import ModesAtRest
 from dlo_casadi.motion.step_function import fixtures_vector, state_vector
 from dlo_casadi.motion.steps import still
 from dlo_casadi.motion.system import MovingCable
+from dlo_casadi.show.swinging import swinging_modes
 
 # Number of points along a cable.
 POINTS = 101
@@ -53,9 +55,27 @@ class Modes:
 
     def plot(self) -> Figure:
         """Draw the modes about the shape."""
+        return draw_modes(self.points, self.shapes, self._names, "modes")
+
+    def animate(self, path: str | PathLike[str]) -> Path:
+        """Write the swinging modes, in real time and without their damping, as an SVG that plays.
+
+        Raises
+        ------
+        DloError
+            If the name of the file does not end in .svg, or if it cannot be written.
+        """
+        path = Path(path)
+        if path.suffix.lower() != ".svg":
+            raise DloError(f"{path}: a moving picture of modes is an SVG.\n  Try: modes.svg")
+        picture = swinging_modes(self.points, self.shapes, self.frequencies, self._names)
+        write_file(path, picture)
+        return path
+
+    @property
+    def _names(self) -> list[str]:
         both = zip(self.frequencies.tolist(), self.damping_ratios.tolist(), strict=True)
-        names = [f"{f:.3g} Hz, damping ratio {zeta:.2g}" for f, zeta in both]
-        return draw_modes(self.points, self.shapes, names, "modes")
+        return [f"{f:.3g} Hz, damping ratio {zeta:.2g}" for f, zeta in both]
 
     def __repr__(self) -> str:
         known = self.frequencies, self.frequency_std, self.damping_ratios, self.damping_ratio_std
@@ -83,23 +103,14 @@ class ShapeInMotion:
         """
         if not isinstance(count, int | np.integer) or count < 1:
             raise DloError(f"modes: a number of modes belongs here, found {count!r}")
-        moving, state, found = _modes(self.cable, self.pose, self.equilibrium, int(count))
-        s = np.linspace(0.0, self.cable.length, POINTS)
-        points, moved = displacements(moving, state, found.vectors, s)
-        changes = [
-            self._modes_of(p, rest, int(count)) - self._modes_of(-p, -rest, int(count))
-            for p, rest in directions(self.cable)
-        ]
-        std = np.sqrt(np.sum(np.square(changes), axis=0)) if changes else np.zeros((2, count))
-        return Modes(found.rates / (2 * np.pi), found.damping_ratios, moved, points, *std)
-
-    def _modes_of(self, p: FloatArray, rest: FloatArray, count: int) -> FloatArray:
-        """Frequencies and damping ratios (2, count) of the cable, changed by half of p and rest."""
-        cable = replace(self.cable, p=self.cable.p + p / 2, rest=self.cable.rest + rest / 2)
-        model, x = cable.model, self.equilibrium.x
-        own = solve_equilibrium(model, cable.p, cable.rest, self.pose, x_init=x)
-        _, _, found = _modes(cable, self.pose, own, count)
-        return np.stack([found.rates / (2 * np.pi), found.damping_ratios])
+        cable = self.cable
+        found = ModesAtRest(
+            cable.model, cable.p, cable.rest, self.equilibrium, self.pose, int(count)
+        )
+        frequencies, ratios = found.numbers()
+        points, moved = found.displacements(np.linspace(0.0, cable.length, POINTS))
+        std = found.std(cable.metadata.uncertainty)
+        return Modes(frequencies, ratios, moved, points, *std)
 
     def at_rest(self) -> tuple[FloatArray, FloatArray]:
         """State (N,) and fixtures (K,) of `CableInMotion.step` of the cable at rest in this shape.
@@ -115,24 +126,11 @@ class ShapeInMotion:
         return state_vector(state), fixtures_vector(moving, fixtures)
 
 
-def _modes(
-    cable: EstimatedCable, pose: HeldPose, equilibrium: Equilibrium, count: int
-) -> tuple[MovingCable, State, DampedModes]:
-    """The cable in motion about an equilibrium, its state there, and its modes."""
-    moving = moving_cable(cable).about(equilibrium.x)
-    fixtures = moving.fixtures(pose.vector)
-    state = moving.at_rest(equilibrium, fixtures)
-    return moving, state, damped_modes(moving, state, fixtures, count)
-
-
 def directions(cable: EstimatedCable) -> list[tuple[FloatArray, FloatArray]]:
     """Changes of p and of the rest curvature by one std, along the covariance's principal axes."""
-    known = cable.metadata.uncertainty
-    both = (by @ known.root for by in known.unknowns_in(cable.model))
-    return list(zip(*(x.T for x in both), strict=True))
+    return modes_at_rest.directions(cable.model, cable.metadata.uncertainty)
 
 
 def moving_cable(cable: EstimatedCable) -> MovingCable:
     """The cable in motion, without effects of the camera."""
-    model, p = cable.model.without_kind(MeasurementEffect, cable.p)
-    return MovingCable(model, p, cable.rest)
+    return modes_at_rest.moving_cable(cable.model, cable.p, cable.rest)

@@ -68,6 +68,7 @@ def damped(chosen: argparse.Namespace) -> Any:
     *POSE,
     DAMPING,
     option("--count", type=int, default=6, metavar="N", help="number of modes (6)"),
+    option("--animate", type=Path, metavar="FILE", help="a moving picture of them: modes.svg"),
     figure("draw them"),
 )
 def modes(chosen: argparse.Namespace) -> None:
@@ -85,6 +86,8 @@ def modes(chosen: argparse.Namespace) -> None:
     names = ("frequencies", "frequency_std", "damping_ratios", "damping_ratio_std")
     page.data({name: getattr(found, name).tolist() for name in names})
     page.say(found)
+    if chosen.animate is not None:
+        page.say(f"Moving picture: {found.animate(chosen.animate)}")
     if chosen.figure is not None:
         page.say(f"Figure: {chosen.figure}")
 

@@ -100,8 +100,7 @@ class Recording:
             f"{name.partition('_')[0]}_frame" if "_" in name else name: _columns(x)
             for name, x in own.moving.items()
         }
-        first = {**own.resting, **{name: x[0] for name, x in own.moving.items()}}
-        return FixturePath.of(_held_by(first), own.fixtures_t, rows)
+        return FixturePath.of(held_by(own.held_at(0)), own.fixtures_t, rows)
 
     @cached_property
     def times(self) -> FloatArray:
@@ -385,7 +384,7 @@ def _columns(rows: FloatArray) -> FloatArray:
     return rows[:, None] if rows.ndim == 1 else rows
 
 
-def _held_by(fields: Mapping[str, FloatArray]) -> HeldPose:
+def held_by(fields: Mapping[str, FloatArray]) -> HeldPose:
     """A pose of numbers by the names of its fields."""
     known: dict[str, Any] = {
         name: float(x) if name.endswith("heading") else tuple(np.ravel(x).tolist())

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
+from markupsafe import Markup
 from rich.table import Table
 
 from dlo_casadi.errors import worded
@@ -10,8 +11,10 @@ from dlo_casadi.report.moving_picture import moving_picture
 from dlo_casadi.report.terminal import plain_table
 from dlo_casadi.session.checked_motions import CheckedMotion
 from dlo_casadi.session.in_motion import MotionStage
+from dlo_casadi.session.measured_modes import MeasuredModes
 from dlo_casadi.session.outcome import Outcome
-from dlo_casadi.show.text import millimetres
+from dlo_casadi.show.swinging import swinging_modes
+from dlo_casadi.show.text import millimetres, plus_minus
 
 _SAID = "Fitted motions are met to {fit:mm}{held_out}; noise alone leaves {noise:mm}."
 _BEFORE = " Without {names} it was {fit:mm}."
@@ -40,7 +43,43 @@ def context_of(outcome: Outcome) -> dict[str, Any]:
         "motion_before": before,
         "motion_sentence": sentence_of(outcome),
         "motion_picture": moving_picture(stages[-1].shown),
+        "modes": outcome.modes,
+        "mode_rows": mode_rows(outcome.modes),
+        "mode_picture": mode_picture(outcome.modes),
     }
+
+
+def mode_rows(modes: MeasuredModes | None) -> list[list[str]]:
+    """Frequencies as fitted and as predicted, and damping ratios, of each mode."""
+    if modes is None:
+        return []
+    pairs = zip(
+        (modes.frequencies, modes.predicted, modes.damping_ratios),
+        (modes.frequency_std, modes.predicted_std, modes.damping_ratio_std),
+        strict=True,
+    )
+    columns = [list(map(plus_minus, x.tolist(), std.tolist())) for x, std in pairs]
+    return [list(row) for row in zip(*columns, strict=True)]
+
+
+def mode_picture(modes: MeasuredModes | None) -> Markup | None:
+    """The swinging modes."""
+    if modes is None:
+        return None
+    names = [f"{rate:.3g} Hz" for rate in modes.frequencies.tolist()]
+    # Numbers and escaped text.
+    return Markup(swinging_modes(modes.points, modes.shapes, modes.frequencies, names))
+
+
+def mode_table(outcome: Outcome) -> Table:
+    """Modes at the end of a recording, on the terminal."""
+    assert outcome.modes is not None
+    title = f"Modes about the shape at rest at the end of {outcome.modes.motion}"
+    columns = ["in motion [Hz]", "from still shapes alone [Hz]", "damping ratio"]
+    table = plain_table(title, ["mode"], columns)
+    for k, row in enumerate(mode_rows(outcome.modes)):
+        table.add_row(str(k + 1), *row)
+    return table
 
 
 def sentence_of(outcome: Outcome) -> str:

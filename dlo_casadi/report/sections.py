@@ -355,8 +355,14 @@ SECTIONS = (
         lambda outcome: "In motion",
         applies=motions.stages_of,
         context=motions.context_of,
-        data=lambda outcome: {"motion_scores": dict(outcome.motion_scores)},
-        terminal=lambda outcome: [motions.motion_table(outcome)],
+        data=lambda outcome: {
+            "motion_scores": dict(outcome.motion_scores),
+            "modes": outcome.modes.as_rows() if outcome.modes else [],
+        },
+        terminal=lambda outcome: [
+            motions.motion_table(outcome),
+            *([motions.mode_table(outcome)] if outcome.modes else []),
+        ],
     ),
     Section(
         "parameters",

@@ -48,6 +48,10 @@ class MeasuredMotion:
     across: FloatArray | None = None
     note: str = ""
 
+    def held_at(self, k: int) -> dict[str, FloatArray]:
+        """By the names of a pose's fields, what is held in row k of the fixtures."""
+        return {**self.resting, **{name: rows[k] for name, rows in self.moving.items()}}
+
     @property
     def compared(self) -> int:
         """Numbers that are compared of each point: all coordinates of markers, d - 1 of lines."""

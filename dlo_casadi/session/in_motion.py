@@ -16,6 +16,7 @@ from dlo_casadi.estimation.motion_start import FIRST_STRETCHES
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.sensing.measured_motion import MeasuredMotion
 from dlo_casadi.session.found_effects import FoundEffect, effect_parameters, with_motions
+from dlo_casadi.session.measured_modes import MeasuredModes, measured_modes
 from dlo_casadi.thresholds import SIGNIFICANCE
 
 
@@ -90,12 +91,14 @@ class MovingResult:
     effects : tuple of FoundEffect
     scores : dict
         Of each candidate, see `search_in_motion`.
+    modes : MeasuredModes or None
     """
 
     fit: Fit
     stages: tuple[MotionStage, ...]
     effects: tuple[FoundEffect, ...]
     scores: dict[str, float]
+    modes: MeasuredModes | None
 
 
 def fit_moving(
@@ -133,6 +136,7 @@ def fit_moving(
         tuple(_stage(one, motions) for one in fits),
         tuple(_found_effect(both, found.after, item) for item in found.added),
         found.scores,
+        measured_modes(fit, both, motions),
     )
 
 

@@ -29,6 +29,7 @@ from dlo_casadi.runtime.work import Part
 from dlo_casadi.sensing.pixels import ViewInput
 from dlo_casadi.session.found_effects import FoundEffect
 from dlo_casadi.session.in_motion import MotionStage
+from dlo_casadi.session.measured_modes import MeasuredModes
 from dlo_casadi.session.pose_shape import BranchShape, EitherSide, PoseShape
 
 StageName = Literal["initial", "stiffness_only", "algorithm1", "batch", "closed"]
@@ -335,6 +336,8 @@ class Outcome:
         Whether the diagnosis has met the bound on its work before everything was tried.
     motion_scores : dict
         Score of each effect that only motion shows, see `search_in_motion`.
+    modes : MeasuredModes, optional
+        Small motions at the end of a recording, if there are recordings.
     work : Part
         What the parts of the run took, in steps and seconds.
     """
@@ -361,6 +364,7 @@ class Outcome:
     versions: dict[str, str] = field(default_factory=dict)
     cut_off: bool = False
     motion_scores: Mapping[str, float] = field(default_factory=dict)
+    modes: MeasuredModes | None = None
     work: Part = field(default_factory=Part)
 
     @cached_property

@@ -307,7 +307,11 @@ class _Run:
             stages.append(replace(own, name="closed", motion=others[-1], explains=last.explains))
         else:
             stages[-1] = replace(own, motion=first, explains=last.explains)
-        more: dict[str, Any] = {"effects": tuple(effects), "motion_scores": result.scores}
+        more: dict[str, Any] = {
+            "effects": tuple(effects),
+            "motion_scores": result.scores,
+            "modes": result.modes,
+        }
         if result.effects and found.get("verdict") == "complete":
             more["verdict"] = "effect_found"
         return result.fit, {**found, **more}

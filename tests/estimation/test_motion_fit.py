@@ -12,15 +12,19 @@ from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.estimation.motion_fit import MotionFit, fit_motions, predicted
+from dlo_casadi.estimation.motion_fit import MotionFit, fit_motions, predicted, repeated_fit
+from dlo_casadi.estimation.recording import held_by
+from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.tolerances import Tolerances
+from dlo_casadi.motion.modes_at_rest import ModesAtRest
 from dlo_casadi.motion.path import FixturePath
 from dlo_casadi.motion.system import MovingCable
 from dlo_casadi.motion.trajectory import way_of
 from dlo_casadi.rod.supports import SupportKind
 from dlo_casadi.sensing.measured_motion import MeasuredMotion
 from dlo_casadi.sensing.measured_pose import MeasuredPose
+from dlo_casadi.session.measured_modes import measured_modes
 
 TRUE = CableData(0.6, 0.06, 0.02, 0.009, straight=True, damping_time=0.03)
 DECLARED = replace(TRUE, bending_stiffness=0.011, damping_time=None)
@@ -78,13 +82,22 @@ def stills() -> list[MeasuredPose]:
     return [still(k, heading) for k, heading in enumerate((-0.2, -0.7, -1.2, 0.3))]
 
 
-def fitted(stills: list[MeasuredPose], **hidden: float) -> MotionFit:
-    fit = fit_model(model_of(DECLARED, 20), stills, Tolerances(), STD)
-    return fit_motions(fit, [motion("carry", 0, **hidden), motion("back", 1, **hidden)])
+@pytest.fixture(scope="module")
+def at_rest(stills: list[MeasuredPose]) -> Fit:
+    return fit_model(model_of(DECLARED, 20), stills, Tolerances(), STD)
 
 
-def test_damping_is_found_and_motions_are_predicted(stills: list[MeasuredPose]) -> None:
-    found = fitted(stills)
+def fitted(at_rest: Fit, **hidden: float) -> MotionFit:
+    return fit_motions(at_rest, [motion("carry", 0, **hidden), motion("back", 1, **hidden)])
+
+
+@pytest.fixture(scope="module")
+def moving(at_rest: Fit) -> MotionFit:
+    return fitted(at_rest)
+
+
+def test_damping_is_found_and_motions_are_predicted(moving: MotionFit) -> None:
+    found = moving
     fit = found.fit
     assert found.converged
     assert 0.85 < found.chi2_per_dof < 1.15
@@ -97,8 +110,24 @@ def test_damping_is_found_and_motions_are_predicted(stills: list[MeasuredPose]) 
     assert not search_in_motion(found).added
 
 
-def test_drag_of_air_is_found(stills: list[MeasuredPose]) -> None:
-    before = fitted(stills, drag=3.0)
+def test_still_shapes_predict_frequencies_that_the_motions_meet(
+    at_rest: Fit, moving: MotionFit
+) -> None:
+    own = motion("carry", 0)
+    modes = measured_modes(at_rest, repeated_fit(moving), [own])
+    model, pose = model_of(TRUE, 24), held_by(own.held_at(-1))
+    p, rest = model.nominal, np.zeros(model.chain.n_rests)
+    eq = solve_equilibrium(model, p, rest, pose)
+    frequencies, ratios = ModesAtRest(model, p, rest, eq, pose, 3).numbers()
+    mesh = 1e-3 * frequencies  # of 20 elements
+    assert (np.abs(modes.predicted - frequencies) < 3 * modes.predicted_std + mesh).all()
+    assert (np.abs(modes.frequencies - frequencies) < 3 * modes.frequency_std + mesh).all()
+    assert (np.abs(modes.damping_ratios - ratios) < 3 * modes.damping_ratio_std).all()
+    assert modes.as_rows()[0]["of"] == "carry"
+
+
+def test_drag_of_air_is_found(at_rest: Fit) -> None:
+    before = fitted(at_rest, drag=3.0)
     found = search_in_motion(before)
     assert [item.candidate.name for item in found.added][:1] == ["air_drag"]
     drag = found.after.fit
@@ -108,8 +137,8 @@ def test_drag_of_air_is_found(stills: list[MeasuredPose]) -> None:
     assert found.after.rmse < before.rmse
 
 
-def test_what_a_tolerance_hides_is_found_without_a_misfit(stills: list[MeasuredPose]) -> None:
-    before = fitted(stills, stiffer=1.13)
+def test_what_a_tolerance_hides_is_found_without_a_misfit(at_rest: Fit) -> None:
+    before = fitted(at_rest, stiffer=1.13)
     assert before.chi2_per_dof < 1.15
     found = search_in_motion(before)
     (effect,) = found.added

@@ -1,12 +1,15 @@
 """Uncertainty of modes, from the covariance of a fit."""
 
 from dataclasses import replace
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
 import dlo_casadi as dlo
 from dlo_casadi.cable.shape_in_motion import directions
+
+SVG = "{http://www.w3.org/2000/svg}"
 
 
 def unsure(cable, **std):
@@ -33,6 +36,15 @@ def test_frequencies_go_with_the_root_of_the_stiffness(rod):
         modes.damping_ratio_std, np.hypot(0.01, 0.05) * modes.damping_ratios, rtol=2e-3
     )
     assert "+-" in repr(modes)
+
+
+def test_modes_swing_in_a_picture(rod, tmp_path):
+    modes = rod.solve(start_heading=0.0).modes(4)
+    drawn = ElementTree.parse(modes.animate(tmp_path / "modes.svg")).getroot()
+    played = [float(x.get("dur", "")[:-1]) for x in drawn.iter(f"{SVG}animate")]
+    np.testing.assert_allclose(played, 1 / modes.frequencies, rtol=1e-3)
+    with pytest.raises(dlo.DloError, match=r"modes.gif: .* SVG"):
+        modes.animate(tmp_path / "modes.gif")
 
 
 def test_a_known_cable_has_none(rod):

@@ -38,6 +38,7 @@ KEYS = {
     "if_hidden": dict,
     "limits": list,
     "motion_scores": dict,
+    "modes": list,
 }
 
 

@@ -1,0 +1,91 @@
+"""Modes of a cable about its shape in a pose, and what the uncertainty of a fit makes of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dlo_casadi.arrays import FloatArray
+from dlo_casadi.effects import MeasurementEffect
+from dlo_casadi.equilibrium.equilibrium import Equilibrium
+from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.equilibrium.solve import solve_equilibrium
+from dlo_casadi.equilibrium.spread import Uncertainty
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.motion.modes import DampedModes, damped_modes, displacements
+from dlo_casadi.motion.state import State
+from dlo_casadi.motion.system import MovingCable
+
+
+def moving_cable(model: CableModel, p: FloatArray, rest: FloatArray) -> MovingCable:
+    """The cable in motion, without effects of the camera."""
+    return MovingCable(*model.without_kind(MeasurementEffect, p), rest)
+
+
+@dataclass(frozen=True, eq=False)
+class ModesAtRest:
+    """Small motions of a cable about its shape at rest in a pose, the slowest first.
+
+    Parameters
+    ----------
+    model : CableModel
+    p : (n_parameters,)
+    rest : (n_rests,) [1/m]
+    equilibrium : Equilibrium
+    pose : HeldPose
+    count : int
+        Number of modes.
+    """
+
+    model: CableModel
+    p: FloatArray
+    rest: FloatArray
+    equilibrium: Equilibrium
+    pose: HeldPose
+    count: int
+
+    def state(self) -> tuple[MovingCable, State, DampedModes]:
+        """The cable about its shape, its state there, and its modes.
+
+        Raises
+        ------
+        DloError
+            If the mesh has fewer modes, or if motion does not know a part of the cable.
+        """
+        moving = moving_cable(self.model, self.p, self.rest).about(self.equilibrium.x)
+        fixtures = moving.fixtures(self.pose.vector)
+        state = moving.at_rest(self.equilibrium, fixtures)
+        return moving, state, damped_modes(moving, state, fixtures, self.count)
+
+    def numbers(self) -> FloatArray:
+        """Frequencies w / (2 pi) [Hz] and damping ratios (2, count); raises as `state` does."""
+        _, _, found = self.state()
+        return np.stack([found.rates / (2 * np.pi), found.damping_ratios])
+
+    def std(self, known: Uncertainty) -> FloatArray:
+        """Standard deviations (2, count) of `numbers` under a fit's covariance, to first order."""
+        total = np.zeros((2, self.count))
+        for p, rest in directions(self.model, known):
+            total += (self._moved(p / 2, rest / 2) - self._moved(-p / 2, -rest / 2)) ** 2
+        return np.sqrt(total)
+
+    def displacements(self, s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Points (K, d) [m] at arc lengths s (K,) [m], and the modes' displacements (count, K, d).
+
+        The largest displacement of each mode is 1.
+        """
+        moving, state, found = self.state()
+        return displacements(moving, state, found.vectors, s)
+
+    def _moved(self, p: FloatArray, rest: FloatArray) -> FloatArray:
+        """`numbers` of the cable with changed parameters and rest strains, in the same pose."""
+        p, rest = self.p + p, self.rest + rest
+        own = solve_equilibrium(self.model, p, rest, self.pose, x_init=self.equilibrium.x)
+        return ModesAtRest(self.model, p, rest, own, self.pose, self.count).numbers()
+
+
+def directions(model: CableModel, known: Uncertainty) -> list[tuple[FloatArray, FloatArray]]:
+    """Changes of p and of the rest strains by one std, along the covariance's principal axes."""
+    both = (by @ known.root for by in known.unknowns_in(model))
+    return list(zip(*(x.T for x in both), strict=True))
