@@ -102,7 +102,7 @@ def test_energy_is_kept_without_damping_and_lost_to_it_with(dimension):
     lost = way.energy[20] - way.energy[-1]
     power = way.power[20:]
     assert np.sum(np.diff(way.t[20:]) * (power[1:] + power[:-1]) / 2) == pytest.approx(
-        lost, rel=2e-3
+        lost, rel=1e-3
     )
 
 
