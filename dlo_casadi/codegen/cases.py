@@ -20,14 +20,12 @@ from dlo_casadi.codegen.statuses import STATUS_TEXTS
 from dlo_casadi.effects import Load
 from dlo_casadi.equilibrium.guess_table import HALF_ANGLE, NUMBERS, SLACKS, GuessRow, guess_table
 from dlo_casadi.equilibrium.guesses import resting_headings
-from dlo_casadi.equilibrium.minima import LONGEST_CHORD
 from dlo_casadi.equilibrium.sides import NEAR_BAR
 from dlo_casadi.equilibrium.solve import MOST_SHED, coarse_rest
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import Lagrangian, lagrangian_of
-from dlo_casadi.rod.band import NEUTRAL
 from dlo_casadi.rod.supports import SupportKind
 
 # Newton steps of a descent, and for a part of a path, as in the templates.
@@ -258,8 +256,6 @@ class Case:
             "MOST_SHED": c_number(MOST_SHED),
             "NEAR_BAR": c_number(NEAR_BAR),
             **{name: c_number(number) for name, number in NUMBERS.items()},
-            "LONGEST_CHORD": c_number(LONGEST_CHORD),
-            "NEUTRAL": c_number(NEUTRAL),
             **feed_marks(model, self.border),
         }
 

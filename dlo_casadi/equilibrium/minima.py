@@ -57,10 +57,6 @@ SHORTER, SAME_SIZE = 0.5, 0.75
 SHORTENED = 6
 # Depth [lengths] of a node in hard obstacles above which there is no room for the cable.
 NO_ROOM = 1e-6
-# Distance of an element's ends over its length up to which its shape counts as one of a rod: its
-# expansion in the bubble misses lengths by the fourth power of the bubble, 1 % at half a radian. A
-# cable of 1 m that hardly resists bending had a minimum that sags by 8.6 m.
-LONGEST_CHORD = 1.01
 # Number of inverse iterations for the direction in which the energy falls: stiff ones vanish in the
 # first, and of the others any mixture in which the energy falls will do.
 MIXED = 8
@@ -160,8 +156,6 @@ def descend(start: Assembly, max_iterations: int = 80) -> Minima:
     pressed = now.lam[:, model.n_lam :].max(axis=1, initial=0.0)
     possible = end.clipped.in_order
     possible &= pressed * gap_per_force(model, DEPTH) < NO_ROOM * model.chain.length
-    there = np.flatnonzero(balanced & possible)
-    possible[there] &= end.subset(there).extent().max(axis=1) <= LONGEST_CHORD
     balanced, converged = balanced & possible, converged & possible
     return Minima(now, balanced, converged, energy, iterations)
 

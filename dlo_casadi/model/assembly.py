@@ -270,18 +270,6 @@ class Assembly(Evaluation):
         moved = np.concatenate([places, rates[..., :1] * tangents(node, self.shapes.x)], axis=2)
         return clipped.evenly(moved[..., None])[:, :, : node.dimension, 0]
 
-    def extent(self) -> FloatArray:
-        """Distances (m, n_segments) between segments' ends over their true lengths: 1 at most.
-
-        More if a segment is bent beyond what its interpolation holds for.
-        """
-        (advance,) = self._call_segments("segment_curve")
-        d, width = self.model.node.dimension, self._arguments[4][..., 1]
-        distance = np.linalg.norm(advance[..., :d, 0], axis=2)
-        return np.divide(
-            distance, width * advance[..., d, 0], np.zeros_like(width), where=width > 0
-        )
-
     def curve(self) -> FloatArray:
         """Measured places (m, n + 1, d), for smooth elements with dr/ds (m, n + 1, 2 d)."""
         (advance,) = self._call_segments("segment_curve")

@@ -302,7 +302,7 @@ def along_unit_frames(model, state):
 @pytest.mark.parametrize("case", [(2, "pinned", "clamped"), (3, "clamped", "pinned")])
 def test_the_step_in_casadi_is_that_of_python(case, tmp_path):
     """Value and Jacobian; both steps end within 1e-9, Python's Jacobian is that of its own end."""
-    model = model_of(*case, n=8)
+    model = model_of(*case, n=4)
     model = replace(model, effects=tuple(x for x in model.effects if x.label != "tether"))
     p, rest = values_of(model), np.zeros(model.chain.n_rests)
     source = generate(model, p, rest, "rope", motion=True)
@@ -316,7 +316,7 @@ def test_the_step_in_casadi_is_that_of_python(case, tmp_path):
     rng, function = np.random.default_rng(0), step_function(cable, DT)
     for _ in range(3):
         own = fixtures_vector(cable, still)
-        own[: 2 * cable.d] += 1e-5 * rng.normal(size=2 * cable.d)
+        own[: 2 * cable.d] += 1e-4 * rng.normal(size=2 * cable.d)
         found, expected = external(state, own), function(state, own)
         assert external.name_out() == [*function.name_out(), "status"]
         assert found[4] == 0
