@@ -452,10 +452,13 @@ def outliers(d: int, runs: int, first: int) -> None:
 
 
 def speed(d: int, runs: int, first: int) -> None:
-    """Processor time of an update: `runs` poses of a wandering gripper, 12 markers, n = 20."""
+    """Processor time of an update: `runs` poses of a wandering gripper, 12 markers, n = 20.
+
+    After the first 40, in which functions are prepared for many evaluations.
+    """
     rng = np.random.default_rng(first)
     cable, ways = rope(d), wandering(d, rng)
-    poses = [seen(cable, next(ways), rng) for _ in range(runs)]
+    poses = [seen(cable, next(ways), rng) for _ in range(40 + runs)]
     for compiled in (False, True):
         known = {"bending_stiffness": 1e-3, "lumped_mass.mass": 1e-3}
         known |= {"torsional_stiffness": 1e-3} if d == 3 else {}
@@ -464,7 +467,7 @@ def speed(d: int, runs: int, first: int) -> None:
             begun = time.process_time()
             tracker.update(pose)
             times.append(1e3 * (time.process_time() - begun))
-        steady = times[40:]  # before, functions are prepared for many evaluations
+        steady = times[40:]
         print(
             f"{d}D, {'C' if compiled else 'Python'}: median {np.median(steady):.1f} ms, "
             f"99 % {np.quantile(steady, 0.99):.1f} ms; the first update {times[0]:.0f} ms"
