@@ -32,6 +32,7 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.fitted_cable import FittedCable
 from dlo_casadi.cable.shape_in_motion import moving_cable
 from dlo_casadi.codegen.fit_steps import compiled_steps
+from dlo_casadi.errors import MotionError
 from dlo_casadi.export import mujoco, pyelastica
 from dlo_casadi.export.rod import Rod
 from dlo_casadi.motion.steps import begun_by, first_step
@@ -151,7 +152,10 @@ def least(
     """Least time [s] within NEAR, told with the mesh and step that need it."""
     best, nearest = (np.inf, "no mesh"), np.inf
     for told, run in runs:
-        seconds, tip = run()
+        try:
+            seconds, tip = run()
+        except MotionError:  # too coarse a mesh, or too long a step
+            continue
         gaps = np.linalg.norm(tip[:, : exact.shape[1]] - exact, axis=1)
         apart = float(gaps.max()) / length if np.isfinite(gaps).all() else np.inf
         nearest = min(nearest, apart)
