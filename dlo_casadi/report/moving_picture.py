@@ -8,6 +8,7 @@ from markupsafe import Markup, escape
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.session.in_motion import MotionShown
+from dlo_casadi.show.swinging import side_view
 
 # Frames a second, longest time [s] that is shown, and number of pixels of the larger side.
 _FRAMES, _LONGEST, _SIZE = 25, 6.0, 420
@@ -33,7 +34,8 @@ def moving_picture(shown: Sequence[MotionShown]) -> MovingPicture | None:
     duration = min(float(one.t[-1]), _LONGEST)
     times = np.arange(0.0, duration, 1 / _FRAMES)
     nearest = np.abs(one.t[:, None] - times).argmin(axis=0)
-    measured, predicted = (_seen_flat(x, one) for x in (one.measured, one.predicted))
+    view = side_view(one.predicted)
+    measured, predicted = one.measured @ view, one.predicted @ view
     points = np.concatenate([measured.reshape(-1, 2), predicted.reshape(-1, 2)])
     low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
     margin = _MARGIN * float((high - low).max())
@@ -78,12 +80,3 @@ def _parts(measured: FloatArray, predicted: FloatArray, duration: float) -> Iter
         )
         x, y = path[0]
         yield f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3" fill="#5B6670">{animated}</circle>'
-
-
-def _seen_flat(points: FloatArray, one: MotionShown) -> FloatArray:
-    """Points (T, K, 2) as seen from the side: along the horizontal way of most motion, and up."""
-    if points.shape[2] == 2:
-        return points
-    horizontal = one.predicted[..., :2].reshape(-1, 2)
-    _, axes = np.linalg.eigh(np.cov(horizontal.T))
-    return np.stack([points[..., :2] @ axes[:, -1], points[..., 2]], axis=-1)

@@ -73,12 +73,17 @@ def _joined(row: FloatArray) -> str:
 
 def _seen_flat(points: FloatArray, moved: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Points (K, 2) and displacements (M, K, 2) from the side."""
-    if points.shape[-1] == 2:
-        return points, moved
-    horizontal = np.concatenate([points[None] + moved, points[None] - moved])[..., :2]
-    _, axes = np.linalg.eigh(np.cov(horizontal.reshape(-1, 2).T))
+    view = side_view(np.concatenate([points[None] + moved, points[None] - moved]))
+    return points @ view, moved @ view
 
-    def flat(x: FloatArray) -> FloatArray:
-        return np.stack([x[..., :2] @ axes[:, -1], x[..., 2]], axis=-1)
 
-    return flat(points), flat(moved)
+def side_view(points: FloatArray) -> FloatArray:
+    """Matrix (d, 2) from points (..., d) to a picture of them; in a plane the unit matrix.
+
+    In space across is the horizontal direction in which they extend most, and up is up.
+    """
+    view = np.eye(points.shape[-1])[:, -2:]
+    if len(view) == 3:
+        _, axes = np.linalg.eigh(np.cov(points[..., :2].reshape(-1, 2).T))
+        view[:, 0] = [*axes[:, -1], 0.0]
+    return view
