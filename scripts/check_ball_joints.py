@@ -12,7 +12,7 @@ With --swivels one end or both hold the direction, too: the other one is a clamp
 
 With --slides a straight cable is fed through one of its ends, from pose to pose another length of
 it; the other end is a clamp. In every third session the tension beyond the end is known, in the
-others free lengths are estimated.
+others free lengths are estimated. Lines and markers in turn.
 
 With --wires a session is a light wire twisted by 1 to 2 turns between two clamps that are known to
 0.05 rad: three or four fitted poses, 11 to 16 points each with 3 mm of noise, 4 mm declared.
@@ -207,10 +207,12 @@ def fed(index: int, generator: np.random.Generator, folder: Path) -> float:
             if not (np.isfinite(tension) and shorter + longer - 2 * here > 0):
                 continue
             pose["end_tension"] = float(tension)
-        s = np.linspace(0.03, 0.97, 60) * free
+        marked = index % 2 == 1
+        s = np.linspace(0.03, 0.97, 12 if marked else 60) * free
         points = rods[0].points(nodes, s) + STD * generator.standard_normal((len(s), 3))
         name = f"p{len(poses)}.csv"
-        write_points(folder / name, points, None)
+        s += (length - free) * (held[0] == "slide")  # as if it had not been fed
+        write_points(folder / name, points, s if marked else None)
         pose |= {"file": name, "start": start.tolist(), "end": end.tolist()}
         pose |= {
             f"{k}_orientation": f.as_quat().tolist() for k, f in zip(SIDES, frames, strict=True)

@@ -1,5 +1,6 @@
 """A cable that is fed through its end: the direction is held, the free length follows."""
 
+import json
 from dataclasses import replace
 
 import casadi as ca
@@ -9,18 +10,26 @@ from perturbed import assert_derivatives
 from scipy.spatial.transform import Rotation
 
 import dlo_casadi as dlo
-from dlo_casadi.config import load_config
+from dlo_casadi.cli import main
+from dlo_casadi.config import dump_yaml, load_config
 from dlo_casadi.effects import CableData, LengthError, MassError, PointForce
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.by_ipopt import by_ipopt
+from dlo_casadi.equilibrium.implicit import SIDES
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.equilibrium.spread import SolvedCable
 from dlo_casadi.equilibrium.symbolic import CasadiCable
 from dlo_casadi.errors import ConfigError, DloError, EquilibriumError
+from dlo_casadi.estimation.batch import solve_batch
+from dlo_casadi.estimation.fit import fit_model
+from dlo_casadi.io.points import write_points
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import HeldClip
+from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.rod.obstacles import Plane
+from dlo_casadi.sensing.measured_pose import MeasuredPose
+from dlo_casadi.sensing.sensors import Markers
 
 LOOM = CableData(1.0, 0.2, 0.01, bending_stiffness=0.02, torsional_stiffness=0.015, straight=True)
 FLAT = replace(LOOM, torsional_stiffness=None)
@@ -456,7 +465,7 @@ experiment:
         ("end_tension: 0.8", "end_tension: 0.8, start_tension: 1", "clamped start has no start_t"),
         ("start: clamped, end: slide", "start: slide, end: free", "runs out of it"),
         ("end_heading: 0.9, ", "", "a slide end needs an end_heading"),
-        ("end_tension: 0.8", "at: [0.1, 0.4, 0.7]", "slides through its end has no at"),
+        ("end_tension: 0.8", "at: [-0.1, 0.4, 0.7]", "at -0.1 m is not between 0 and"),
         ("end: slide", "end: slipping", "slide"),
     ],
 )
@@ -469,3 +478,160 @@ def test_sessions_that_cannot_be(tmp_path, old, new, said):
     path.write_text(SESSION.replace(old, new))
     with pytest.raises(ConfigError, match=said):
         load_config(path)
+
+
+def marked_session(space, side, known, seed=0, count=5):
+    """A session of markers on a cable fed through that end, and what was fed in each pose.
+
+    Markers stand on what is between the ends in that pose, 12 % of it apart, give or take 9 %.
+    """
+    rng, d, poses, fed = np.random.default_rng(seed), 2 + space, [], []
+    model, pose, _ = case(space, 0.8, 40)
+    rest = np.zeros(model.chain.n_rests)
+    while len(poses) < count:
+        end = np.array(pose.end) * rng.uniform(0.9, 1.25) + rng.uniform(-0.05, 0.05, d)
+        own = replace(pose, end=tuple(end), end_tension=float(rng.uniform(0.8, 2.0)))
+        here = (model, own, rest) if side == "end" else reversed_case(model, own, rest)
+        try:
+            held = SolvedCable.of(here[0], here[0].nominal, here[2], here[1])
+        except EquilibriumError:
+            continue
+        fed.append(held.equilibrium.fed)
+        shares = 0.04 + 0.92 * (np.arange(8) + rng.uniform(0.1, 0.9, 8)) / 8
+        low = 0.0 if side == "end" else -fed[-1]
+        at = np.round(low + shares * (LOOM.length + fed[-1]), 4)
+        places = (at - low) * LOOM.length / (LOOM.length + fed[-1])
+        points = held.curve.at(places) + 3e-4 * rng.standard_normal((len(at), d))
+        kept = {name: x for name, x in here[1].directions.items() if name != "turns"}
+        kept |= {f"{side}_tension": own.end_tension} if known else {}
+        role = "held_out" if len(poses) == 2 else "fit"
+        one = dlo.Pose(here[1].start, here[1].end, points=points, at=at, role=role, **kept)
+        poses.append(one)
+    cable = dlo.Cable(
+        length=1.0, mass=0.2, diameter=0.01, bending_stiffness=0.03, rest_shape="straight"
+    )
+    boundary = ("clamped", "slide") if side == "end" else ("slide", "clamped")
+    held = {"gravity": model.gravity, "boundary": boundary, "std": 3e-4, "model": {"n": 20}}
+    return dlo.Session(cable, poses, **held), fed
+
+
+@pytest.mark.parametrize(("space", "side"), [(False, "end"), (True, "start")])
+def test_markers_on_a_fed_cable(space, side):
+    """They keep their places on the cable, whatever length of it is between its ends.
+
+    In the plane tensions are known in one fit, in the other free lengths are unknowns; IPOPT finds
+    the same minimum.
+    """
+    for known in (True, False)[space:]:
+        session, fed = marked_session(space, side, known, count=4)
+        ends = dict(zip(SIDES, ("clamped", "slide")[:: 1 if side == "end" else -1], strict=True))
+        model = replace(case(space, 0.0, 12)[0], fed_by_length=not known, **ends)
+        poses = [
+            MeasuredPose.of_points(pose.held, np.array(pose.points), s=np.array(pose.at))
+            for pose in session.experiment.poses
+        ]
+        if not known:
+            poses = [item.fed_as_seen(1.0, model.loose) for item in poses]
+        fit = fit_model(model, poses, Tolerances(), 3e-4)
+        name = "bending_stiffness"
+        assert abs(fit.value(name) - 0.02) < 3 * fit.std(name)
+        ends = [seen.curve.ends for seen in fit.problem.observed(fit.point)]
+        np.testing.assert_allclose(np.ptp(ends, axis=1) - 1.0, fed, atol=1e-3)
+        if not space:
+            solution, _ = solve_batch(fit.problem, fit.point)
+            std = np.sqrt(np.diag(fit.covariance))
+            np.testing.assert_array_less(np.abs(solution.theta - fit.point.theta), 0.05 * std)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("space", [False, True])
+def test_intervals_of_cables_with_markers_that_are_fed(space):
+    """Of ten sessions the true stiffness is outside its interval in one at most."""
+    outside = []
+    for seed in range(1, 11):
+        session, _ = marked_session(space, SIDES[seed % 2], known=seed % 3 == 0, seed=seed)
+        low, high = session.fit().params["bending_stiffness"].interval_95
+        outside += [seed] * (not low < 0.02 < high)
+    assert len(outside) < 2, outside
+
+
+def test_a_session_of_markers_on_a_fed_cable_from_its_file_to_a_prediction(tmp_path):
+    """YAML and CSV, `dlo fit`, report.json, and the free length that it tells in `dlo predict`."""
+    session, fed = marked_session(False, "start", known=False, count=4)
+    poses = []
+    for k, pose in enumerate(session.experiment.poses):
+        write_points(tmp_path / f"p{k}.csv", pose.points, pose.at)
+        held = {name: list(np.atleast_1d(x)) for name, x in pose.held.directions.items()}
+        held = {name: float(x[0]) for name, x in held.items()}
+        held |= {"start": list(pose.start), "end": list(pose.end), "role": str(pose.role)}
+        poses.append({"file": f"p{k}.csv", **held})
+    assert min(pose.at[0] for pose in session.experiment.poses) > 0.1
+    document = {
+        "cable": {"length": 1.0, "mass": 0.2, "diameter": 0.01, "bending_stiffness": 0.03},
+        "experiment": {
+            "gravity": [0.0, -9.81],
+            "boundary": {"start": "slide", "end": "clamped"},
+            "measurement": {"kind": "centerlines", "std": 3e-4},
+            "poses": poses,
+        },
+        "model": {"n": 12},
+        "estimation": {"algorithm1": False},
+        "diagnosis": {"enabled": False},
+    }
+    document["cable"]["rest_shape"] = "straight"
+    path, results = tmp_path / "fed.yaml", tmp_path / "results"
+    path.write_text(dump_yaml(document))
+    assert main(["fit", str(path), "--output", str(results), "--jobs", "1"]) == 0
+    report = json.loads((results / "report.json").read_text())
+    low, high = report["stages"][-1]["parameters"]["bending_stiffness"]["interval_95"]
+    assert low < 0.02 < high
+    assert report["stages"][-1]["rmse_held_out"] < 2e-3
+    cable, pose = dlo.load(results / "parameters.yaml"), session.experiment.poses[0]
+    held = pose.held.directions
+    shape = cable.solve(pose.end, start=pose.start, **held, free_length=1.0 + fed[0])
+    s = np.array(pose.at) + fed[0]  # from where the cable comes out of the guide
+    np.testing.assert_allclose(shape.curve.at(s), pose.points, atol=3e-3)
+
+
+@pytest.mark.parametrize(("space", "side"), [(False, "end"), (True, "start"), (False, "start")])
+@pytest.mark.parametrize("by_length", [False, True])
+def test_derivatives_of_markers(space, side, by_length):
+    """Residuals along parameters and each pose's free length, beside those of other equilibria."""
+    model, pose, rest = held_between(space, ("pinned",), n=12)
+    if side == "start":
+        model, pose, rest = reversed_case(model, pose, rest)
+    eq = solve_equilibrium(model, model.nominal, rest, pose)
+    if by_length:
+        told = {f"{side}_tension": None, "free_length": LOOM.length + eq.fed}
+        model, pose = replace(model, fed_by_length=True), replace(pose, **told)
+        eq = solve_equilibrium(model, model.nominal, rest, pose)
+    equilibria, p = BatchEquilibrium(model, [pose]), model.nominal
+    low, high = (-eq.fed, 1.0) if side == "start" else (0.0, 1.0 + eq.fed)
+    s = low + (high - low) * np.array([0.1, 0.35, 0.62, 0.95])
+    markers, n_own = Markers(np.zeros((4, 2 + space)), np.ones(4), s), len(model.deviations)
+    slopes = np.zeros((len(p), 1))
+    slopes[model.names.index("bending_stiffness")] = 1.0
+    shapes, _ = equilibria.solve(eq.shapes, p, rest, tolerance=1e-13)
+
+    def moved(k, step):
+        deviation = shapes.deviation.copy()
+        if k:
+            deviation[0, equilibria.used_deviations[k - 1]] += step
+        there = replace(shapes, deviation=deviation)
+        own = p + (step * slopes[:, 0] if k == 0 else 0.0)
+        there, ok = equilibria.solve(there, own, rest, tolerance=1e-13)
+        assert ok.all()
+        (seen,) = equilibria.seen(there, own, rest)
+        return markers.residual(seen, markers.located(seen, s))
+
+    along = equilibria.directions(shapes, p, rest, slopes, np.zeros((len(rest), 1)))
+    ((seen, change),) = equilibria.observe(shapes, p, rest, along)
+    places = markers.located(seen, s)
+    np.testing.assert_allclose(places, model.cable.length * (s - low) / (high - low), atol=1e-12)
+    _, found = markers.linearized(seen, places, change)
+    h = 2e-5
+    for k in range(1 + n_own):
+        rows = [moved(k, step * h) for step in (-2, -1, 1, 2)]
+        expected = (rows[0] - 8 * rows[1] + 8 * rows[2] - rows[3]) / (12 * h)
+        scale = np.abs(expected).max()
+        np.testing.assert_allclose(found[:, k], expected, atol=2e-8 * scale + 1e-12)

@@ -41,7 +41,7 @@ from dlo_casadi.effects import EFFECTS, UNKNOWN_MASS, CableData
 from dlo_casadi.errors import ConfigError
 from dlo_casadi.rod.chain import RestCurvature
 from dlo_casadi.rod.quantities import QUANTITIES
-from dlo_casadi.rod.supports import ENDS
+from dlo_casadi.rod.supports import ENDS, place_problem
 
 
 def load_config(path: str | Path) -> Config:
@@ -244,9 +244,9 @@ def _contradictions(experiment: Experiment, length: float) -> Iterator[ConfigPro
         if pose.branch == "previous" and i == 0:
             text = "branch: previous needs a pose before this one; use ccw or cw"
             wrong.append((text, "branch"))
-        if outside := [s for s in pose.at or () if not 0.0 <= s <= length]:
-            text = f"at {outside[0]:g} m is not between 0 and cable.length {length:g} m: arc"
-            wrong.append((f"{text} length from the start, in metres?", "at"))
+        for text in filter(None, (place_problem(s, length, held.fed) for s in pose.at or ())):
+            wrong.append((f"at {text}: arc length from the start, in metres?", "at"))
+            break
         for message, key in wrong:
             yield ConfigProblem((*at, key) if key else at, f"{_called(i, pose)}: {message}")
         for message, k in clip_problems(pose.clips, length, len(experiment.gravity)):
@@ -334,8 +334,6 @@ def _end_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, str
             article = ("an" if key == "end" else "a") if how.slides else "no"
             all_of = ", in all poses or in none" if how.slides else ""
             yield f"a {how} {key} has {article} {key}_tension [N]{all_of}", None
-        if how.slides and pose.at is not None:
-            yield f"a cable that slides through its {key} has no at: arc lengths of points", None
     if pose.free_length is not None and not experiment.fed_by_length:
         yield "free_length is of a cable that slides through an end, without a tension there", None
     if pose.branch in ("ccw", "cw") and space:

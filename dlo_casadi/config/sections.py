@@ -89,7 +89,8 @@ class Pose(ConfigSection):
     points: Given[Points | None, Rows | None] = entry(default=None)
     """Points [[x, y], ...] along the cable [m], in space [[x, y, z], ...], instead of a file."""
     at: Given[ArcLengths | None, Numbers | None] = entry(default=None)
-    """Arc lengths [m] of the points from the start, [s, ...], which makes them markers."""
+    """Arc lengths [m] of the points from the start, [s, ...], which makes them markers. Of a cable
+    that is fed through its start they are its length less what is from there to its end."""
     name: Annotated[Name, checked(no_file_name)] = entry(default="", validate_default=True)
     """What to call the pose; as its file without folder and ending, or by its number, when
     absent."""

@@ -43,6 +43,11 @@ class Boundary(ConfigSection):
     the pose."""
 
     @property
+    def fed(self) -> tuple[bool, bool]:
+        """Whether the cable is fed through its start, and through its end."""
+        return self.start.slides, self.end.slides
+
+    @property
     def directed(self) -> bool:
         """Whether an end holds the direction of the cable."""
         return self.start.direction or self.end.direction

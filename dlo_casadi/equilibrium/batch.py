@@ -7,12 +7,13 @@ from pose to pose.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import repeat
 from typing import Any
 
 import numpy as np
 
 from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
-from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange
+from dlo_casadi.equilibrium.curve import Observed, ObservedChange, curves_of
 from dlo_casadi.equilibrium.equilibrium import END_TOLERANCE, JOINT_BOUND
 from dlo_casadi.equilibrium.minima import (
     KEEPING_SIDE,
@@ -392,24 +393,24 @@ class BatchEquilibrium:
         self, shapes: Shapes, p: FloatArray, rest: FloatArray, along: Tangents
     ) -> list[tuple[Observed, ObservedChange]]:
         """Predicted measurements of each pose, and their derivatives along directions."""
-        here, length = self.at(shapes, p, rest), self.model.cable.length
-        curves, moved = here.curve_along(along)
+        here = self.at(shapes, p, rest)
+        _, moved = here.curve_along(along)
         felt: FloatArray = np.zeros((self.m, 0))
         changes: FloatArray = np.zeros((self.m, 0, along.x.shape[3]))
         if self.wrenches:
             felt, changes = here.readings(), here.readings_along(along)
-        each = zip(curves, felt, moved, changes, strict=True)
+        ends = here.ends_along(along) if self.model.slides else repeat(None)
+        each = zip(curves_of(here), felt, moved, changes, ends, strict=False)
         return [
-            (Observed(NodeCurve.of(length, z), readings), ObservedChange(change, reading_change))
-            for z, readings, change, reading_change in each
+            (Observed(curve, readings), ObservedChange(*change))
+            for curve, readings, *change in each
         ]
 
     def seen(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> list[Observed]:
         """Predicted measurements of each pose."""
-        here, length = self.at(shapes, p, rest), self.model.cable.length
+        here = self.at(shapes, p, rest)
         felt = here.readings() if self.wrenches else np.zeros((self.m, 0))
-        both = zip(here.curve(), felt, strict=True)
-        return [Observed(NodeCurve.of(length, z), readings) for z, readings in both]
+        return [Observed(*both) for both in zip(curves_of(here), felt, strict=True)]
 
     def readings(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> FloatArray:
         """Wrench measurements (m, n_reactions) [N, N m] that each pose would give."""

@@ -1,14 +1,16 @@
 """A curve through nodes, projections of points onto it, and predicted measurements of a pose."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import repeat
 from typing import Self
 
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray, IntArray, chord_lengths, cross, unit
 from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.model.assembly import Assembly
 
 _NEWTON_STEPS = 12
 # Coefficients (powers of u, weights) of the interpolants.
@@ -27,19 +29,27 @@ class NodeCurve:
 
     With derivatives the curve is the cubic Hermite interpolant, which differs from an arc of
     curvature k by less than h^4 k^3 / 384; without them it consists of chords.
+
+    Places on it are arc lengths of what is between its ends, scaled to `length`. `ends` (2,) [m]:
+    arc lengths of its ends on the cable, where that is fed; else None, which is 0 and `length`.
     """
 
     length: float
     nodes: FloatArray
     slopes: FloatArray | None
+    ends: FloatArray | None = None
 
     @classmethod
-    def of(cls, length: float, z: FloatArray) -> Self:
+    def of(cls, length: float, z: FloatArray, ends: FloatArray | None = None) -> Self:
         """Curve from rows of places, or of places and dr/ds: (n + 1, d or 2 d), d = 2 or 3."""
         if z.shape[1] < 4:
             return cls(length, z, None)
         d = z.shape[1] // 2
-        return cls(length, z[:, :d], z[:, d:])
+        return cls(length, z[:, :d], z[:, d:], ends)
+
+    def places_of(self, s: FloatArray) -> FloatArray:
+        """Places (K,) [m] of arc lengths s on the cable, see `ends`."""
+        return s if self.ends is None else between(s, self.ends, self.length)
 
     def along(self, length: float) -> Self:
         """The same curve by arc lengths of a cable of another length [m]."""
@@ -73,7 +83,7 @@ class NodeCurve:
     def _local(self, s: FloatArray) -> tuple[IntArray, FloatArray]:
         """Element index (K,) and the fraction (K,) of its length at s [m]."""
         u = s * (self.n / self.length)
-        e = np.minimum(u.astype(np.intp), self.n - 1)
+        e = np.minimum(np.maximum(u.astype(np.intp), 0), self.n - 1)
         return e, u - e
 
     @cached_property
@@ -99,14 +109,23 @@ class NodeCurve:
         """Positions (K, d) [m] at arc lengths s, or derivatives by s."""
         return self.frame(s, derivative)[derivative]
 
-    def moved(self, s: FloatArray, change: FloatArray) -> FloatArray:
-        """Change (K, d, q) [m] at fixed s, from the change (n + 1, d or 2 d, q) of `numbers`."""
+    def moved(
+        self, s: FloatArray, change: FloatArray, ends: FloatArray | None = None
+    ) -> FloatArray:
+        """Change (K, d, q) [m] at fixed s, from the change (n + 1, d or 2 d, q) of `numbers`.
+
+        Given the change (2, q) [m] of its `ends`, that of the points of the cable that are there.
+        """
         e, u = self._local(s)
         w = (np.vander(u, 4, increasing=True) @ self._table)[:, :, None, None]
         out = w[:, 0] * change[e, : self.d] + w[:, 1] * change[e + 1, : self.d]
         if self.slopes is not None:
             h = self.length / self.n
             out += h * (w[:, 2] * change[e, self.d :] + w[:, 3] * change[e + 1, self.d :])
+        if ends is not None and self.ends is not None:
+            share = (s / self.length)[:, None]
+            passed = ((1 - share) * ends[0] + share * ends[1]) / (self.ends[1] - self.ends[0])
+            out -= self.length * self.at(s, 1)[..., None] * passed[:, None]
         return np.asarray(out)
 
     def followed(
@@ -161,6 +180,11 @@ class NodeCurve:
     def distances(self, points: FloatArray) -> FloatArray:
         """Distance (K,) [m] of each point to the nearest place on the curve."""
         return np.linalg.norm(points - self.at(self.nearest(points)), axis=1)
+
+
+def between(s: FloatArray, ends: Sequence[float] | FloatArray, length: float) -> FloatArray:
+    """Arc lengths s on a cable as shares of what is between its `ends` (2,) [m], times a length."""
+    return np.asarray((s - ends[0]) * (length / (ends[1] - ends[0])))
 
 
 def across(t: FloatArray) -> FloatArray:
@@ -228,8 +252,16 @@ class Observed:
 class ObservedChange:
     """Change of an `Observed` along q directions.
 
-    `curve` (n + 1, d or 2 d, q), `readings` (n_reactions, q).
+    `curve` (n + 1, d or 2 d, q), `readings` (n_reactions, q); `ends` (2, q) [m] of the curve's ends
+    on the cable, where that is fed.
     """
 
     curve: FloatArray
     readings: FloatArray
+    ends: FloatArray | None = None
+
+
+def curves_of(found: Assembly) -> list[NodeCurve]:
+    """Measured curves of m shapes."""
+    length, ends = found.model.cable.length, found.ends if found.model.slides else repeat(None)
+    return [NodeCurve.of(length, z, own) for z, own in zip(found.curve(), ends, strict=False)]

@@ -30,6 +30,7 @@ from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import tangents
 from dlo_casadi.model.contact import surfaces_at
 from dlo_casadi.model.functions import functions_of
+from dlo_casadi.rod.ends import fed_ends
 from dlo_casadi.rod.node import Frame
 
 # Distance [lengths] within which two places are one; eyelets 1 mm apart are no difficulty.
@@ -211,17 +212,16 @@ def border_guess(model: CableModel, p: FloatArray, pose: HeldPose) -> FloatArray
     border = np.zeros(model.n_border)
     if model.slides:
         *_, length = true_ends(model, p, pose)
-        places = fed_places(model, length / float(functions_of(model).stretch(p)))
-        border[[*places]] = [*places.values()]
+        free = length / float(functions_of(model).stretch(p))
+        ends = fed_ends(free, model.cable.length, model.loose)
+        border[[*fed_rows(model)]] = [ends[k] for k in fed_rows(model).values()]
     return border
 
 
-def fed_places(model: CableModel, length: float) -> dict[int, float]:
-    """Border row of each end that slides -> arc length [m], for a length between the ends [m]."""
-    start, end = (model.sliding.get(k) for k in (0, len(model.clips) + 1))
-    more = (length - model.cable.length) / max(sum(model.loose), 1)
-    found = {} if start is None else {start: -more}
-    return found if end is None else found | {end: model.cable.length + more}
+def fed_rows(model: CableModel) -> dict[int, int]:
+    """Border row of the arc length of each end that slides -> 0 for the start, 1 for the end."""
+    both = enumerate(model.sliding.get(k) for k in (0, len(model.clips) + 1))
+    return {row: end for end, row in both if row is not None}
 
 
 def border_of(model: CableModel, pose: HeldPose, x: FloatArray) -> FloatArray:

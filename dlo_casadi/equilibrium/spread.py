@@ -14,7 +14,7 @@ from scipy.special import ndtri
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.effects import EFFECTS, Effect, MeasurementEffect, Setup
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
-from dlo_casadi.equilibrium.curve import NodeCurve
+from dlo_casadi.equilibrium.curve import NodeCurve, curves_of
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium, ways_of
@@ -63,7 +63,7 @@ class SolvedCable:
     @cached_property
     def curve(self) -> NodeCurve:
         """The curve by declared arc length; the true one if the model has no camera's effects."""
-        return NodeCurve.of(self.model.cable.length, self.assembly.curve()[0])
+        return curves_of(self.assembly)[0]
 
     @property
     def places(self) -> FloatArray:

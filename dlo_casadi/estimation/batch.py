@@ -8,10 +8,10 @@
           rest_(j+1) = rest_after(x_j, rest_j)                         (only with a state)
 
 The measurements enter through R_j, the triangular factor of the whitened residuals' Jacobian by z,
-the numbers of the curve and of the wrench measurements (for lines: whitening x normals x Hermite
-interpolation). |R_j z - b_j|^2 equals the sum of squares up to a constant. Projections and normals
-are updated between solves until they no longer change. The normal distance is stationary in s at a
-projection, so the fixed point solves the consistent problem.
+the numbers of the curve, of its ends where they slide, and of the wrench measurements (for lines:
+whitening x normals x Hermite interpolation). |R_j z - b_j|^2 equals the sum of squares up to a
+constant. Projections and normals are updated between solves until they no longer change. The normal
+distance is stationary in s at a projection, so the fixed point solves the consistent problem.
 
 This NLP has the same minimum as `descent.descend`, but it eliminates nothing and its Hessian is
 exact.
@@ -30,7 +30,7 @@ from dlo_casadi.estimation.problem import Problem
 from dlo_casadi.estimation.unknowns import Point, Values
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS
-from dlo_casadi.model.whole_pose import PoseSymbols, balance, curve, readings, rest_after
+from dlo_casadi.model.whole_pose import PoseSymbols, balance, curve, ends, readings, rest_after
 
 # Projections that move less than this share of the noise between solves have converged.
 SHIFT_TOLERANCE = 1e-3
@@ -124,7 +124,7 @@ class _BatchNlp:
         scale = per_force / model.cable.length
         imbalance = balance(model, symbols) * scale
         felt = readings(model, symbols) if problem.equilibria.wrenches else ca.SX(0, 1)
-        z = ca.vertcat(curve(model, symbols), felt)
+        z = ca.vertcat(curve(model, symbols), ends(model, symbols), felt)
         after = ca.SX.zeros(0)
         if model.has_state:
             after = rest_after(model, symbols) / model.cable.curvature_scale
@@ -257,12 +257,14 @@ class _BatchNlp:
         out: list[FloatArray] = []
         unit, seen = np.eye(self.n_z), problem.observed(point)
         for j, s, white in zip(problem.used, point.projections, problem.whitening, strict=True):
-            curve, readings = seen[j].curve.numbers, seen[j].readings
-            by_curve = unit[: curve.size].reshape((*curve.shape, self.n_z))
-            each = ObservedChange(by_curve, unit[curve.size :])
+            curve, readings, held = seen[j].curve.numbers, seen[j].readings, seen[j].curve.ends
+            held = np.zeros(0) if held is None else held
+            by_curve, by_ends, by_readings = np.split(unit, [curve.size, curve.size + held.size])
+            by_curve = by_curve.reshape((*curve.shape, self.n_z))
+            each = ObservedChange(by_curve, by_readings, by_ends if held.size else None)
             residual, change = problem.measured[j].linearized(seen[j], s, each)
             rows = -white @ change
-            target = white @ residual + rows @ np.concatenate([curve.ravel(), readings])
+            target = white @ residual + rows @ np.concatenate([curve.ravel(), held, readings])
             triangle = np.linalg.qr(np.column_stack([rows, target]), mode="r")
             padded = np.zeros((self.n_rows, self.n_z + 1))
             keep = min(self.n_rows, len(triangle))

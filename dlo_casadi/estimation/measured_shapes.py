@@ -9,9 +9,9 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.effects import BoundaryEffect, Kinematics, MeasurementEffect
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
-from dlo_casadi.equilibrium.curve import Observed, ObservedChange, denoised_length
+from dlo_casadi.equilibrium.curve import Observed, ObservedChange
 from dlo_casadi.equilibrium.measured_line import line_nodes
-from dlo_casadi.equilibrium.spans import fed_places, first_guesses
+from dlo_casadi.equilibrium.spans import fed_rows, first_guesses
 from dlo_casadi.estimation.problem import Problem
 from dlo_casadi.model.assembly import Shapes, Tangents
 from dlo_casadi.model.cable_model import END_ROLL, STIFFNESSES, CableModel
@@ -86,9 +86,9 @@ def with_fed_lengths(
     lam = shapes.lam.copy()
     for j, item in measured if model.slides else ():
         if item.has_line:
-            length = denoised_length(item.pose.joined(item.points))[-1]
-            for row, place in fed_places(model, float(length)).items():
-                lam[j, row] = place
+            ends = item.ends(model.cable.length, model.loose)
+            for row, end in fed_rows(model).items():
+                lam[j, row] = ends[end]
     return replace(shapes, lam=lam)
 
 
@@ -111,7 +111,8 @@ def _along(
         pose = item.pose.rolled(roll)
         pose = pose if turns is None else replace(pose, turns=turns[j])
         if item.has_points:  # of readings alone it stays the first guess
-            along[j] = line_nodes(item.points, pose, model, item.places(chain.length))
+            at = item.places(chain.length, model.loose)
+            along[j] = line_nodes(item.points, pose, model, at)
     seen = [j for j in used if measured[j].has_points]
     fitted = [measured[j] for j in seen]
     wrenches = any(item.reactions for item in fitted if not item.has_line)
@@ -143,7 +144,7 @@ def _kinematics(
     shapes = with_fed_lengths(equilibria.start_shapes(x), model, zip(used, fitted, strict=True))
     lines = [item.traced if item.has_line else item for item in fitted]
     each, flat = _each_node(equilibria), np.zeros(model.chain.n_rests)
-    projections = [item.places(model.chain.length) for item in lines]
+    projections = [item.places(model.chain.length, model.loose) for item in lines]
     cost = [np.inf for _ in used]
     steps = _KINEMATIC_STEPS if all(x.has_line for x in lines) else _STEPS_WITHOUT_DEPTH
     for iteration in range(steps + 1):

@@ -9,7 +9,7 @@ from itertools import groupby
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.equilibrium.curve import NodeCurve, Observed
+from dlo_casadi.equilibrium.curve import NodeCurve, Observed, curves_of
 from dlo_casadi.equilibrium.equilibrium import (
     NEARBY,
     Equilibrium,
@@ -172,11 +172,11 @@ def _seen(
     if not poses:
         return []
     given = Inputs.of(p, rest, np.array([pose.vector for pose in poses]))
-    found, length = Assembly(model, stacked(equilibria), given), model.cable.length
+    found = Assembly(model, stacked(equilibria), given)
     return [
-        Prediction(model, p, rest, pose, eq, Observed(NodeCurve.of(length, z), shown))
-        for pose, eq, z, shown in zip(
-            poses, equilibria, found.curve(), found.readings(), strict=True
+        Prediction(model, p, rest, pose, eq, Observed(curve, shown))
+        for pose, eq, curve, shown in zip(
+            poses, equilibria, curves_of(found), found.readings(), strict=True
         )
     ]
 
@@ -266,7 +266,7 @@ def _along_line(model: CableModel, p: FloatArray, line: MeasuredPose) -> list[Fl
         pose = pose.rolled(float(p[model.names.index(END_ROLL)]))
     told = pose.turns or model.has_state
     ways = ([] if told else ways_round(model, pose)) or [pose]
-    places = line.places(model.cable.length)
+    places = line.places(model.cable.length, model.loose)
     return [line_nodes(line.points, way, model, places) for way in ways]
 
 

@@ -12,6 +12,7 @@ from dlo_casadi.arrays import FloatArray, chord_lengths, length_of
 from dlo_casadi.errors import MeasurementError
 from dlo_casadi.io.files import write_file
 from dlo_casadi.io.tables import Columns, read_table
+from dlo_casadi.rod.supports import SAME_PLACE, place_problem
 
 COLUMNS = ["x_m", "y_m", "z_m"]
 PLACE = "s_m"
@@ -21,9 +22,6 @@ _UNITS = {"mm": 1000, "cm": 100, "um": 1_000_000}
 
 _LONGEST = 100.0
 """Length of a centre-line [m] from which on it is not in metres."""
-
-_SAME_POINT = 1e-9
-"""Distance [m] below which two points in a row are one."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +47,7 @@ class MeasuredPoints:
         start: Sequence[float],
         end: Sequence[float] | None,
         length: float,
+        fed: tuple[bool, bool] = (False, False),
         name: str | None = None,
         place: str = "at",
     ) -> "MeasuredPoints":
@@ -61,19 +60,15 @@ class MeasuredPoints:
         if s is not None:
             order = np.argsort(s, kind="stable")
             points, s = points[order], s[order]
-            twice = s[1:][np.diff(s) <= _SAME_POINT]
+            twice = s[1:][np.diff(s) <= SAME_PLACE]
             if len(twice):
                 raise MeasurementError(f"{place} {twice[0]:g} m stands twice", pose=name)
-            outside = s[(s < 0) | (s > length + _SAME_POINT)]
-            if len(outside):
-                raise MeasurementError(
-                    f"{place} {outside[0]:g} m is not between 0 and cable.length {length:g} m: "
-                    "arc length from the start, in metres?",
-                    pose=name,
-                )
+            for text in filter(None, (place_problem(x, length, fed) for x in s)):
+                asked = "arc length from the start, in metres?"
+                raise MeasurementError(f"{place} {text}: {asked}", pose=name)
         else:
             step = np.linalg.norm(np.diff(points, axis=0), axis=1)
-            points = points[np.concatenate(([True], step > _SAME_POINT))]
+            points = points[np.concatenate(([True], step > SAME_PLACE))]
         if len(points) == 1:
             raise MeasurementError("holds one point only; a pose takes two or more", pose=name)
         along = length_of(points)
@@ -111,6 +106,7 @@ def read_points(
     start: Sequence[float],
     end: Sequence[float] | None = None,
     length: float = math.inf,
+    fed: tuple[bool, bool] = (False, False),
 ) -> MeasuredPoints:
     """Read a measured line, or markers at known arc lengths, and put them in order.
 
@@ -125,7 +121,7 @@ def read_points(
     end : (d,) [m], optional
         Fixture of its end.
     length : float [m]
-        Of the cable: no marker lies beyond it.
+        Of the cable: no marker lies beyond it, unless it is `fed` through its start or its end.
 
     Returns
     -------
@@ -146,7 +142,7 @@ def read_points(
         raise MeasurementError("has a header but no points", pose=source.name)
     points = np.column_stack([table[axis] for axis in axes])
     found = MeasuredPoints(points, table[PLACE] if PLACE in table.columns else None)
-    return found.in_order(start, end, length, source.name, PLACE)
+    return found.in_order(start, end, length, fed, source.name, PLACE)
 
 
 def _runs_backwards(

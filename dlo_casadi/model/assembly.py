@@ -276,6 +276,15 @@ class Assembly(Evaluation):
         (rows,) = self._call_stations("station", advance)
         return self.clipped.evenly(rows)[..., 0]
 
+    @property
+    def ends(self) -> FloatArray:
+        """Arc lengths (m, 2) [m] of both ends on the cable: 0 and its length, unless it is fed."""
+        return self.clipped.held[:, [0, -1]]
+
+    def ends_along(self, along: Tangents) -> FloatArray:
+        """Change (m, 2, q) [m] of `ends` along directions."""
+        return self._slips_of(along)[:, [0, -1]]
+
     def _call_stations(self, name: str, advance: FloatArray) -> list[FloatArray]:
         model, (m, count) = self.model, (len(advance), self.model.chain.n + 1)
         start = self.given.poses[:, : model.node.dimension]

@@ -223,6 +223,15 @@ def curve(model: CableModel, s: PoseSymbols) -> ca.SX:
     return ca.vec(functions.station(points, rates, both, s.p, s.pose))
 
 
+def ends(model: CableModel, s: PoseSymbols) -> ca.SX:
+    """Arc lengths (2,) [m] of both ends on a cable that is fed; none of others."""
+    if not model.slides:
+        return ca.SX(0, 1)
+    known, last = Laid.ends(model, s), len(model.clips) + 1
+    rows = (model.sliding.get(k) for k in (0, last))
+    return ca.vertcat(*(own if k is None else s.lam[k] for own, k in zip(known, rows, strict=True)))
+
+
 def readings(model: CableModel, s: PoseSymbols) -> ca.SX:
     """Wrench measurements (n_reactions,) [N, N m] of sensors, see `ends.reaction_rows`."""
     return functions_of(model).readings(*end_arguments(model, s))

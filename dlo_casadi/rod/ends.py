@@ -45,6 +45,15 @@ def deviation_names(node: type[Node], clips: int = 0) -> tuple[str, ...]:
     return tuple(f"{what}_{name}" for what, names in parts for name in names)
 
 
+def fed_ends(free: float, length: float, fed: tuple[bool, bool]) -> tuple[float, float]:
+    """Arc lengths [m] of both ends on a cable of this length, `free` [m] of which is between them.
+
+    `fed`: whether it is fed through its start, through its end; half the difference through each.
+    """
+    more = (free - length) / max(sum(fed), 1)
+    return -more * fed[0], length + more * fed[1]
+
+
 def held_turns(kind: SupportKind, node: type[Node], frame: ca.SX, x: ca.SX) -> ca.SX:
     """Turns [rad] from the frame of an end to its node x that a support of this kind holds at zero.
 

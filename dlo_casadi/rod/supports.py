@@ -7,6 +7,9 @@ import numpy as np
 from dlo_casadi.arrays import BoolArray
 from dlo_casadi.rod.node import Node
 
+# Distance [m] below which two places on a cable are one.
+SAME_PLACE = 1e-9
+
 
 class Holds(Flag):
     """Parts of a cable's place and frame that a support holds at its node.
@@ -67,6 +70,16 @@ class SupportKind(StrEnum):
     def without_roll(self) -> "SupportKind":
         """The kind that holds the same except the roll of the cable."""
         return next(kind for kind, held in HOLDS.items() if held == self.holds & ~Holds.ROLL)
+
+
+def place_problem(s: float, length: float, fed: tuple[bool, bool] = (False, False)) -> str:
+    """Why no point at the arc length s [m] of a cable is between its ends; empty if one may be.
+
+    `fed`: whether the cable is fed through its start, through its end: there may be more of it.
+    """
+    if (s >= 0 or fed[0]) and (s <= length + SAME_PLACE or fed[1]):
+        return ""
+    return f"{s:g} m is not between 0 and cable.length {length:g} m"
 
 
 _POINT = Holds.PLACE | Holds.ALONG

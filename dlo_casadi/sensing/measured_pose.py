@@ -10,8 +10,16 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
-from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange
+from dlo_casadi.equilibrium.curve import (
+    NodeCurve,
+    Observed,
+    ObservedChange,
+    between,
+    denoised_length,
+)
+from dlo_casadi.equilibrium.measured_line import marked_ends
 from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.rod.ends import fed_ends
 from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.sensing.sensors import Centerline, Markers, Sensor, Wrench, line_or_markers
 
@@ -171,9 +179,29 @@ class MeasuredPose:
         ends = np.cumsum([len(x.points) for x in self.sensors])[:-1]
         return zip(self.sensors, *(np.split(values, ends) for values in per_point), strict=True)
 
-    def places(self, length: float) -> FloatArray:
-        """First guess of the points' arc lengths (K,) [m], without a curve."""
-        return np.concatenate([sensor.places(self.pose, length) for sensor in self.sensors])
+    def places(self, length: float, fed: tuple[bool, bool] = (False, False)) -> FloatArray:
+        """First guess of the points' places (K,) [m] on a curve, without one.
+
+        `fed`: whether the cable is fed through its start, through its end.
+        """
+        found = [sensor.places(self.pose, length) for sensor in self.sensors]
+        if any(fed):
+            ends = self.ends(length, fed)
+            each = zip(self.sensors, found, strict=True)
+            found = [between(s, ends, length) if x.marked else s for x, s in each]
+        return np.concatenate(found)
+
+    def fed_as_seen(self, length: float, fed: tuple[bool, bool]) -> Self:
+        """The same pose with the free length that its points show, see `ends`."""
+        low, high = self.ends(length, fed) if self.has_points else (0.0, length)
+        return replace(self, pose=replace(self.pose, free_length=high - low))
+
+    def ends(self, length: float, fed: tuple[bool, bool]) -> tuple[float, float]:
+        """First guess of the arc lengths [m] of both ends on a cable that is `fed`."""
+        (line,), pose = self.traced.sensors[:1], self.pose
+        if isinstance(line, Markers):
+            return marked_ends(line.points, line.s, pose, length, fed)
+        return fed_ends(float(denoised_length(pose.joined(line.points))[-1]), length, fed)
 
     def located(self, seen: Observed, places: FloatArray) -> FloatArray:
         """Arc lengths (K,) [m] at which the points are compared with this curve."""

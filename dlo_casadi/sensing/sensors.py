@@ -103,22 +103,22 @@ class Sensor(ABC):
 
 
 class _Known(Sensor):
-    """A sensor with known arc lengths s (K,) [m] of its points."""
+    """A sensor with known arc lengths s (K,) [m] of its points on the cable."""
 
     s: FloatArray
     marked = True
 
     def places(self, pose: HeldPose, length: float) -> FloatArray:
-        """The known arc lengths (K,) [m]."""
+        """The known arc lengths (K,) [m], of a cable that is not fed."""
         return self.s
 
     def located(self, seen: Observed, places: FloatArray) -> FloatArray:
-        """The known arc lengths (K,) [m]."""
-        return self.s
+        """Places (K,) [m] of the known arc lengths on this curve."""
+        return self.nearest(seen.curve)
 
     def nearest(self, curve: NodeCurve) -> FloatArray:
-        """The known arc lengths (K,) [m]."""
-        return self.s
+        """Places (K,) [m] of the known arc lengths on a curve."""
+        return curve.places_of(self.s)
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,8 @@ class _Points(Sensor):
     ) -> tuple[FloatArray, FloatArray]:
         """Residual (R,) [m] and its change (R, q) along directions."""
         gap = self.points - seen.curve.at(places)
-        moved = -seen.curve.moved(places, along.curve)
+        ends = along.ends if self.marked else None
+        moved = -seen.curve.moved(places, along.curve, ends)
         both = self.components(seen.curve, places, np.dstack([gap, moved]))
         return both[:, 0], both[:, 1:]
 
@@ -211,7 +212,8 @@ class Centerline(_Points):
 class Markers(_Known, _Points):
     """Points at known arc lengths, compared in all directions: d residuals each.
 
-    Where the cable's length is estimated, arc lengths scale with it.
+    Where the cable's length is estimated, arc lengths scale with it; where it is fed, they stay on
+    the cable.
 
     Parameters
     ----------

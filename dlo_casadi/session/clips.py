@@ -35,10 +35,10 @@ class _Passed:
 
 def wrong_clips(session: ReadSession) -> tuple[Suspicion, ...]:
     """Clips that are far from the measured lines, out of order, or not of the declared kind."""
-    length = session.config.cable.length
+    length, fed = session.config.cable.length, session.config.experiment.boundary.fed
     poses = [(session.declared[item.name], item) for item in session.read]
     passed = [
-        [_passed(pose, item, clip, length) for clip in pose.held.clips] for pose, item in poses
+        [_passed(pose, item, clip, length, fed) for clip in pose.held.clips] for pose, item in poses
     ]
     found: list[Suspicion] = []
     for own in zip(*passed, strict=True):  # one clip in all poses
@@ -49,12 +49,16 @@ def wrong_clips(session: ReadSession) -> tuple[Suspicion, ...]:
     return tuple(found or _out_of_order(passed, length))
 
 
-def _passed(pose: Pose, item: PoseInput, clip: HeldClip, length: float) -> _Passed:
+def _passed(
+    pose: Pose, item: PoseInput, clip: HeldClip, length: float, fed: tuple[bool, bool]
+) -> _Passed:
     line = pose.held.joined(item.points)
     s = chord_lengths(line)
     chords = np.diff(s)
     if item.s is not None:
-        s = np.concatenate([[0.0], item.s, [] if pose.end is None else [length]])
+        first = item.s[0] - chords[0] if fed[0] else 0.0
+        last = item.s[-1] + chords[-1] if fed[1] else length
+        s = np.concatenate([[first], item.s, [] if pose.end is None else [last]])
     elif pose.end is not None:
         s = s * length / s[-1]
     steps, toward = np.diff(line, axis=0), np.array(clip.place) - line[:-1]

@@ -52,13 +52,16 @@ def coarse_fit(session: ReadSession, most: int = POSES) -> Coarse:
 
     Declared effects keep their declared values; one that changes from pose to pose is left out.
     """
-    measured, length = [], session.config.cable.length
+    measured, length, experiment = [], session.config.cable.length, session.config.experiment
     for k in spread(len(session.read), most):
         item = session.read[k]
         kept = spread(len(item.points), _POINTS)
         s = None if item.s is None else item.s[kept]
         pose = session.declared[item.name].held
-        measured.append(MeasuredPose.of_points(pose, item.points[kept], s=s))
+        seen = MeasuredPose.of_points(pose, item.points[kept], s=s)
+        if experiment.fed_by_length and pose.free_length is None:
+            seen = seen.fed_as_seen(length, experiment.boundary.fed)
+        measured.append(seen)
     declared = declared_model(session.config, known=True)
     # A set depends on the poses between those that are fitted here.
     effects = tuple(x for x in declared.model.effects if x.kind != "state")

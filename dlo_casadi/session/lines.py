@@ -36,7 +36,7 @@ class Lines:
         Length of the cable.
     gaps : (m, 2) [m]
         Expected arc lengths between the fixtures and the ends of the measured line: for markers and
-        for lines with sparse points; otherwise zero.
+        for lines with sparse points; otherwise zero. Infinite from markers to an end that slides.
     known : (m,) of bool
         Whether the start of the line is known, as it is for markers.
     how : str

@@ -10,7 +10,6 @@ import numpy as np
 
 from dlo_casadi import vision
 from dlo_casadi.config import Config, DeclaredCamera, Images, Pose
-from dlo_casadi.equilibrium.curve import denoised_length
 from dlo_casadi.errors import MeasurementError, counted
 from dlo_casadi.io.points import MeasuredPoints, read_points
 from dlo_casadi.runtime.progress import Step, nobody
@@ -95,11 +94,6 @@ def measured_poses(config: Config, inputs: Sequence[PoseInput]) -> tuple[Measure
 def _measured(pose: Pose, item: PoseInput, std: float, config: Config) -> MeasuredPose:
     """Convert a pose with its sensors; pixels of weight one have standard deviation `std` [m]."""
     held = replace(pose.held, camera_center=item.camera_center)
-    if config.experiment.fed_by_length and held.free_length is None:
-        length = config.cable.length
-        if len(item.points) > 1:
-            length = float(denoised_length(held.joined(item.points))[-1])
-        held = replace(held, free_length=length)
     held_out = pose.role == "held_out"
     if item.views:
         found = [pixels_of(view, std, len(item.points) > 0) for view in item.views]
@@ -110,6 +104,8 @@ def _measured(pose: Pose, item: PoseInput, std: float, config: Config) -> Measur
         seen = MeasuredPose(held, (means,), held_out, line_or_markers(item.points, s=item.s))
     else:
         seen = MeasuredPose.of_points(held, item.points, item.weight, held_out, item.s)
+    if config.experiment.fed_by_length and held.free_length is None:
+        seen = seen.fed_as_seen(config.cable.length, config.experiment.boundary.fed)
     return seen.with_readings(pose.readings) if item.readable else seen
 
 
@@ -134,13 +130,15 @@ def _read_nothing(config: Config, pose: Pose) -> PoseInput:
 
 
 def _read_csv(config: Config, pose: Pose) -> PoseInput:
-    return _thinned(pose, read_points(pose.paths[0], pose.start, pose.end, config.cable.length))
+    held = config.cable.length, config.experiment.boundary.fed
+    return _thinned(pose, read_points(pose.paths[0], pose.start, pose.end, *held))
 
 
 def _read_points(config: Config, pose: Pose) -> PoseInput:
     s = None if pose.at is None else np.array(pose.at)
     found = MeasuredPoints(np.array(pose.points), s)
-    return _thinned(pose, found.in_order(pose.start, pose.end, config.cable.length))
+    held = config.cable.length, config.experiment.boundary.fed
+    return _thinned(pose, found.in_order(pose.start, pose.end, *held))
 
 
 def _thinned(pose: Pose, read: MeasuredPoints) -> PoseInput:

@@ -62,7 +62,13 @@ class ReadSession:
 def _lines(config: Config, read: dict[str, PoseInput]) -> Lines:
     """Ends and lengths of lines or markers, by the names of their poses."""
     length, d = config.cable.length, len(config.experiment.gravity)
-    whole, spans, gaps, lengths = np.array([0.0, length]), [], [], []
+    fed, whole, spans, gaps, lengths = (
+        np.array(config.experiment.boundary.fed),
+        np.array([0.0, length]),
+        [],
+        [],
+        [],
+    )
     poses = [pose for pose in config.experiment.poses if pose.name in read]
     items = [read[pose.name] for pose in poses]
     for item in items:
@@ -73,7 +79,8 @@ def _lines(config: Config, read: dict[str, PoseInput]) -> Lines:
         steps = np.linalg.norm(np.diff(own, axis=0), axis=1)
         apart = float(np.median(steps)) if len(steps) else length
         far = apart > FITS * length and item.s is None
-        gaps.append(np.abs(span - whole) + (max(length - steps.sum(), 0.0) if far else 0.0))
+        beyond = np.where(fed & (item.s is not None), np.inf, np.abs(span - whole))
+        gaps.append(beyond + (max(length - steps.sum(), 0.0) if far else 0.0))
         sparse = np.diff(own[spread(len(own), _SPARSE)], axis=0)
         lengths.append(np.linalg.norm(sparse, axis=1).sum())
         spans.append(span[1] - span[0] if span[1] > span[0] else np.inf)  # one marker has no length

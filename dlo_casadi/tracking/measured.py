@@ -49,7 +49,7 @@ class Measured:
     ----------
     points : (K, d) [m]
     s : (K,) [m]
-        Their places along the cable.
+        Their arc lengths on the cable if they are `marked`, else their places on the last curve.
     marked : bool
         Whether these were measured, too; else only distances across the cable count.
     readings, rows, std : (r,)
@@ -109,6 +109,10 @@ class Measured:
             mixed = np.linalg.cholesky(alike)
         return replace(self, s=s, mixed=mixed)
 
+    def _places(self, seen: Observed) -> FloatArray:
+        """Places (K,) [m] of its points on a curve."""
+        return seen.curve.places_of(self.s) if self.marked else self.s
+
     def _across(self, seen: Observed, moved: FloatArray) -> FloatArray:
         """Displacements (K, d, q), or of a line those across it (K, d - 1, q)."""
         if self.marked or not len(self.points):
@@ -125,18 +129,19 @@ class Measured:
 
     def rms(self, seen: Observed) -> float:
         """Root mean square [m] of a coordinate's distance from its prediction."""
-        gap = (self.points - seen.curve.at(self.s))[..., None]
+        gap = (self.points - seen.curve.at(self._places(seen)))[..., None]
         return float(np.sqrt(np.square(self._across(seen, gap)).mean())) if gap.size else 0.0
 
     def off(self, seen: Observed) -> FloatArray:
         """Measured minus predicted (R,), in units of the noise."""
-        gap = (self.points - seen.curve.at(self.s))[..., None]
+        gap = (self.points - seen.curve.at(self._places(seen)))[..., None]
         felt = (self.readings - seen.readings[self.rows]) / self.std if self.rows else np.zeros(0)
         return np.concatenate([self._rows(seen, gap)[:, 0], felt])
 
     def along(self, seen: Observed, change: ObservedChange) -> FloatArray:
         """Derivatives (R, q) of what is predicted, in units of the noise."""
-        rows = self._rows(seen, seen.curve.moved(self.s, change.curve))
+        ends = change.ends if self.marked else None
+        rows = self._rows(seen, seen.curve.moved(self._places(seen), change.curve, ends))
         if not self.rows:
             return rows
         return np.vstack([rows, change.readings[self.rows] / self.std[:, None]])
