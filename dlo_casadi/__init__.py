@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from dlo_casadi.errors import MeasurementError as MeasurementError
     from dlo_casadi.errors import VisionError as VisionError
     from dlo_casadi.tracking.tracker import Tracker as Tracker
-    from dlo_casadi.tracking.tracker import Update as Update
+    from dlo_casadi.tracking.update import Update as Update
 
 # Module -> its public names. They are imported on first use, so that the command responds at once
 # and handles an interrupt.
@@ -44,7 +44,8 @@ _PUBLIC = {
     "cable.fitted_cable": "FittedCable Shape",
     "cable.move": "Move",
     "cable.placing": "Placing",
-    "tracking.tracker": "Tracker Update",
+    "tracking.tracker": "Tracker",
+    "tracking.update": "Update",
     "codegen": "CompiledSolver",
     "config": "Cable Clip FixturePath Motion Obstacle Pose",
     "effects": "EFFECTS",

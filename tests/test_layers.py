@@ -48,7 +48,16 @@ MAY_IMPORT: dict[str, set[str]] = {
     "estimation": {*MECHANICS, "motion", "codegen", "sensing", "runtime"},
     "paper": {*MECHANICS, "sensing"},
     "diagnosis": {*MECHANICS, "sensing", "estimation", "runtime"},
-    "tracking": {*MECHANICS, "config", "io", "codegen", "sensing", "diagnosis"},
+    "tracking": {
+        *MECHANICS,
+        "motion",
+        "config",
+        "io",
+        "codegen",
+        "sensing",
+        "estimation",
+        "diagnosis",
+    },
 }
 FITTING = {*MECHANICS, "sensing", "estimation", "diagnosis"}
 MAY_IMPORT["recordings"] = {"config", "vision", "io"}

@@ -165,9 +165,8 @@ def fit_motions(
     # Still poses may be means of many frames.
     own = float(np.median([one.noise for one in measured if not one.held_out]))
     std = float(np.hypot(own if own > _NOISIER * std else std, MESH_ERROR * model.cable.length))
-    moving = unknowns_in_motion(fit.problem.unknowns)
     begun = [
-        begin(Recording(one, tolerances, LONGEST_STEP), fit, moving, std)
+        begin(Recording(one, tolerances, LONGEST_STEP), fit.problem, fit.point.theta, std)
         for one in measured
         if not one.held_out
     ]
@@ -343,7 +342,7 @@ def predicted(now: MotionFit, measured: MeasuredMotion) -> FloatArray:
     if measured.at_rest:
         own: FloatArray = np.zeros(len(recording.own_std(unknowns.model)))
     else:
-        found = begin(recording, fit, unknowns, now.std)
+        found = begin(recording, fit.problem, theta, now.std)
         recording, own, near = found.recording, found.own, found.seen.first
     whole = replace(recording, until=np.inf)
     return whole.evaluate(unknowns, theta, own, near).points

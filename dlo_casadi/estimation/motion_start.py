@@ -11,7 +11,6 @@ from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.measured_shapes import measured_shapes
 from dlo_casadi.estimation.problem import Problem
 from dlo_casadi.estimation.recording import MODES, Recording, Seen, rest_state
-from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.tolerances import Tolerances
@@ -55,9 +54,10 @@ def unknowns_in_motion(unknowns: Unknowns) -> Unknowns:
     return replace(unknowns, model=unknowns.model.with_mesh(MESH))
 
 
-def begin(recording: Recording, fit: Fit, unknowns: Unknowns, std: float) -> FittedMotion:
-    """A recording with its own unknowns fitted at the parameters of a fit."""
-    model, theta, measured = unknowns.model, fit.point.theta, recording.measured
+def begin(recording: Recording, problem: Problem, theta: FloatArray, std: float) -> FittedMotion:
+    """A recording with its own unknowns fitted at the unknowns theta of still poses."""
+    unknowns = unknowns_in_motion(problem.unknowns)
+    model, measured = unknowns.model, recording.measured
     cable = MovingCable(model, unknowns.p(theta), unknowns.rest(theta))
     near: State | None = None
     own: FloatArray = np.zeros(len(recording.own_std(model)))
@@ -69,7 +69,7 @@ def begin(recording: Recording, fit: Fit, unknowns: Unknowns, std: float) -> Fit
     recording = replace(recording, dt=dt, period=period, rest=rest)
     ends = [*FIRST_STRETCHES[1:]]
     if not measured.at_rest:
-        basis = basis.near(cable, _frames(recording, fit, unknowns), fixtures)
+        basis = basis.near(cable, _frames(recording, problem, unknowns), fixtures)
         recording, near, ends = replace(recording, basis=basis), basis.about, [*FIRST_STRETCHES]
         own = np.zeros(len(recording.own_std(model)))
     found = None
@@ -95,13 +95,13 @@ def frequencies_at_first(model: CableModel, measured: MeasuredMotion, count: int
     return np.asarray(found[found > _FREE * cable.slowest][:count] / (2 * np.pi))
 
 
-def _frames(recording: Recording, fit: Fit, unknowns: Unknowns) -> FloatArray:
+def _frames(recording: Recording, known: Problem, unknowns: Unknowns) -> FloatArray:
     """Frames (n_nodes, coordinates) along the points of the first instant."""
     measured = recording.measured
     held = recording.path.pose
     seen = np.isfinite(measured.points[0, :, 0])
     pose = MeasuredPose.of_points(held, measured.points[0][seen], s=measured.s[seen])
-    problem = Problem(unknowns, (pose,), fit.noise, fit.problem.priors)
+    problem = Problem(unknowns, (pose,), known.noise, known.priors)
     return np.asarray(measured_shapes(problem)[0].x[0])
 
 

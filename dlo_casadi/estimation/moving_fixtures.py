@@ -6,7 +6,6 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.effects.clock_delay import CLOCK_DELAY
-from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.motion import sensitivities
 from dlo_casadi.motion.path import FixturePath
 from dlo_casadi.motion.sensitivities import Numbers
@@ -72,14 +71,15 @@ class GivenNumbers:
         path: FixturePath,
         ways: Ways,
         cable: MovingCable,
-        unknowns: Unknowns,
-        theta: FloatArray,
+        by_p: FloatArray,
+        by_rest: FloatArray,
     ) -> None:
+        """`by_p`, `by_rest`: derivatives of parameters and rest strains by theta."""
         place, turns = ways
         model, own = cable.model, place.shape[1]
         self._path, self.cable = path, cable
-        self.p = np.pad(unknowns.slopes(theta), ((0, 0), (0, own)))
-        rest = model.chain.rest_inside(unknowns.rest_slopes)
+        self.p = np.pad(by_p, ((0, 0), (0, own)))
+        rest = model.chain.rest_inside(by_rest)
         self.rest = np.pad(rest, ((0, 0), (0, 0), (0, own)))
         q, d = self.p.shape[1], cable.d
         self.turns = np.pad(turns, ((0, 0), (q - own, 0)))

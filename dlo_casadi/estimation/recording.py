@@ -17,6 +17,7 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import EquilibriumError, EstimationError
 from dlo_casadi.estimation.moving_fixtures import GivenNumbers, HeldFixtures
+from dlo_casadi.estimation.stepping import started, stepped, within
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.tolerances import Tolerances
@@ -26,7 +27,6 @@ from dlo_casadi.motion.handles import between
 from dlo_casadi.motion.path import FixturePath
 from dlo_casadi.motion.sensitivities import Columns, Stepping, Tangent
 from dlo_casadi.motion.state import Fixtures, State
-from dlo_casadi.motion.steps import Moving, begun_by, first_step
 from dlo_casadi.motion.system import MovingCable
 from dlo_casadi.sensing.measured_motion import MeasuredMotion
 
@@ -38,8 +38,6 @@ MODES = 8
 AMPLITUDE = 0.3
 # States whose points are evaluated at once.
 _AT_ONCE = 200
-# Halvings of a step of time whose Newton's method fails.
-_HALVINGS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,7 +176,13 @@ class Recording:
             at_rest = rest_state(cable, fixtures, rest_near)
             cable = cable.about(at_rest.x) if _depends_on_rest(model) else cable
         numbers = (
-            GivenNumbers(self.path, self.ways(model), cable, unknowns, theta)
+            GivenNumbers(
+                self.path,
+                self.ways(model),
+                cable,
+                unknowns.slopes(theta),
+                unknowns.rest_slopes,
+            )
             if derivatives
             else None
         )
@@ -225,78 +229,28 @@ class Recording:
     ) -> Iterator[tuple[State, Columns | None]]:
         """The state at each time, and its derivatives."""
         times = self.times
-        columns = self._first_columns(held, first, numbers)
+        columns = None if numbers is None else self.first_columns(held, first, numbers)
         yield first, columns
         if len(times) == 1:
             return
         dt = min(self.dt, float(times[1] - times[0]))
-        within = [_within(begin, end, self.dt) for begin, end in pairwise(times)]
-        held.prepare(np.concatenate([[dt], *(at for at, _ in within)]), numbers)
-        now, columns = self._started(held, first, columns, dt, numbers)
-        before = dt
-        for ends, dt in within:
+        stretches = [within(begin, end, self.dt) for begin, end in pairwise(times)]
+        held.prepare(np.concatenate([[dt], *(at for at, _ in stretches)]), numbers)
+        now = started(held, first, columns, (0.0, dt), numbers)
+        for ends, dt in stretches:
             for at in ends:
-                now, columns = _for_step(now, columns, dt / before)
-                now, columns, before = self._stepped(steps, held, now, columns, at, dt, numbers)
-            yield now.state, columns
+                now = stepped(steps, held, now, at, dt, numbers)
+            yield now.moving.state, now.columns
 
-    def _first_columns(
-        self, held: HeldFixtures, first: State, numbers: GivenNumbers | None
-    ) -> Columns | None:
-        """Derivatives of the first state."""
-        if numbers is None:
-            return None
-        cable, at_first, given = held.cable, numbers.at(0.0), held.at(0.0)
+    def first_columns(
+        self, held: HeldFixtures, first: State, numbers: GivenNumbers, at: float = 0.0
+    ) -> Columns:
+        """Derivatives of the first state, which is that of a time of the fixtures [s]."""
+        cable, at_first, given = held.cable, numbers.at(at), held.at(at)
         if self.basis is None:
             return sensitivities.at_rest(Tangent(cable, first, given), at_first)
         own = held.own[-2 * self.basis.forces.shape[1] :]
         return columns_of(cable, first, given, self.basis, at_first, own)
-
-    def _started(
-        self,
-        held: HeldFixtures,
-        first: State,
-        columns: Columns | None,
-        dt: float,
-        numbers: GivenNumbers | None,
-    ) -> tuple[Moving, Columns | None]:
-        cable, fixtures = held.cable, held.at(dt)
-        tried = first_step(cable, first, fixtures, dt)
-        if tried is None:
-            raise EstimationError("the first step of a motion was not found")
-        now = begun_by(first, tried)
-        if numbers is None or columns is None:
-            return now, None
-        tangent = Tangent(cable, tried.state, fixtures)
-        return now, sensitivities.started(first, tried, columns, tangent, numbers.at(dt), dt)
-
-    def _stepped(
-        self,
-        steps: Stepping,
-        held: HeldFixtures,
-        now: Moving,
-        columns: Columns | None,
-        at: float,
-        dt: float,
-        numbers: GivenNumbers | None,
-    ) -> tuple[Moving, Columns | None, float]:
-        """One step of time to `at`, halved where Newton's method fails; the last step [s]."""
-        for halving in range(_HALVINGS + 1):
-            parts, small = 2**halving, dt / 2**halving
-            ahead, along = _for_step(now, columns, 1 / parts)
-            for k in range(parts):
-                t = at - dt + (k + 1) * small
-                fixtures = held.at(t)
-                after = steps.step(ahead, fixtures, small)
-                if after is None:
-                    break
-                if numbers is not None and along is not None:
-                    given = numbers.at(t)
-                    along = steps.derived(ahead, after, along, fixtures, given, small)
-                ahead = after
-            else:
-                return ahead, along, small
-        raise EstimationError(f"no step of time was found at {at:.3f} s")
 
     def _seen(
         self,
@@ -343,23 +297,6 @@ class Recording:
         s = self.measured.s
         segment = np.clip(np.searchsorted(low, s, side="right") - 1, 0, len(low) - 1)
         return segment, (s - low[segment]) / width[segment]
-
-
-def _within(begin: float, end: float, longest: float) -> tuple[list[float], float]:
-    """Ends [s] of even steps from one time to another, and their length."""
-    count = int(np.ceil((end - begin) / longest - 1e-9))
-    dt = (end - begin) / count
-    return [begin + (k + 1) * dt for k in range(count)], dt
-
-
-def _for_step(now: Moving, columns: Columns | None, factor: float) -> tuple[Moving, Columns | None]:
-    """A state continued with a step of another length, and its derivatives."""
-    if abs(factor - 1) < 1e-12:
-        return now, columns
-    if columns is not None:
-        known = columns.accelerations
-        columns = replace(columns, own=known + factor * (columns.own - known))
-    return now.for_step(factor), columns
 
 
 def _depends_on_rest(model: CableModel) -> bool:

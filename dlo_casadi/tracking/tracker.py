@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config import Pose
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import DloError
@@ -27,8 +26,10 @@ from dlo_casadi.tracking.changes import Jumps, Probe
 from dlo_casadi.tracking.inquiry import JUDGED, Change, Inquiry
 from dlo_casadi.tracking.known import Known
 from dlo_casadi.tracking.measured import Noise
+from dlo_casadi.tracking.motion import TrackerInMotion
 from dlo_casadi.tracking.seen import Seen, joined, learned, smoothed
 from dlo_casadi.tracking.shaper import Shaper
+from dlo_casadi.tracking.update import Update
 
 # So many poses in a row that are refused are a change.
 IN_A_ROW = 3
@@ -45,43 +46,8 @@ WINDOW, LOOK, ODD = 30, 5, 0.01
 _TESTS = ("_suspicion", "_since", "_refused")
 
 
-@dataclass(frozen=True, eq=False)
-class Update:
-    """What one pose told.
-
-    Parameters
-    ----------
-    number : int
-        Of the pose, the first is 1.
-    innovation : (R,)
-        Measured minus predicted before the pose was used, whitened: independent, of std 1.
-    rms : float [m]
-        Root of the mean square of the points' part of it, in metres.
-    probability : float
-        Of an innovation as large by chance.
-    refused : bool
-        Whether the pose was left out, because that is less than 1 in 100,000.
-    change : Change or None
-        If the cable is another one than before: an alarm, or news of its cause.
-    iterations : int
-    """
-
-    number: int
-    innovation: FloatArray
-    rms: float
-    probability: float
-    refused: bool
-    change: Change | None
-    iterations: int
-
-    def __repr__(self) -> str:
-        text = f"{1e3 * self.rms:.3g} mm off the prediction, p = {self.probability:.2g}"
-        text += ", refused" if self.refused else ""
-        return text + (f", {self.change}" if self.change else "")
-
-
 @dataclass(eq=False)
-class Tracker:
+class Tracker(TrackerInMotion):
     """A cable that is estimated while it is handled.
 
     Parameters
@@ -114,11 +80,19 @@ class Tracker:
         self._kept: deque[tuple[dict[str, Any], Pose]] = deque()
         self._begin()
         self._go_on_from(self._known)
+        self._end_motion()
 
     def _go_on_from(self, known: Known) -> None:
         """What is known before the next pose; what earlier ones told stays as it is."""
         self._known = self._base = known
         self._learned: list[Seen] = []
+
+    def _learn_in_motion(self, known: Known) -> None:
+        """What motion told is kept; the poses before it are not looked at again."""
+        if self._kept:
+            self._begin()
+            self._kept.clear()
+        self._go_on_from(known)
 
     def _begin(self) -> None:
         """Forget the last poses, but not what they told."""
@@ -155,6 +129,7 @@ class Tracker:
         """
         if not isinstance(pose, Pose):
             raise DloError(f"update: a Pose belongs here, found {pose!r}\n  Try: dlo.Pose(...)")
+        self._end_motion()
         self._kept.append((self._now(), pose))
         try:
             return self._updated(pose)
