@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 from scipy.linalg import solve_triangular
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from dlo_casadi.arrays import BoolArray, FloatArray
 from dlo_casadi.diagnosis.candidates import Candidate, candidates, setup_of
@@ -325,7 +325,8 @@ class Jumps:
             k = self._likeliest(own)
             score, step, std = self._tried(k, own, vanish)
             price = one.size * float(np.log(self._sums["poses"][k]))
-            log_p = float(chi2.logsf(score, len(one.names)))
+            with np.errstate(divide="ignore"):
+                log_p = float(np.log(chdtrc(len(one.names), score)))
             steps, stds = (dict(zip(one.names, x.tolist(), strict=True)) for x in (step, std))
             out.append(Jump(one, self.since[k], score, price, log_p, steps, stds))
         return sorted(out, key=lambda jump: -jump.worth)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -75,17 +76,24 @@ class Known:
         own = self.scale[:, None] * root
         return self.with_covariance(own @ own.T)
 
-    def apart(self, other: Known) -> FloatArray:
-        """Unknowns (n,) minus those of another cable, of stiffnesses the ratio's logarithm."""
+    @cached_property
+    def unknowns(self) -> FloatArray:
+        """Values (n,) of the unknowns, of stiffnesses their logarithms."""
         model, names = self.model, self.uncertainty.names
-        rise = np.where(self._logs, np.log(self.rises(self.p, other.p)), self.p - other.p)
-        values = dict(zip(model.names, rise, strict=True))
+        own = np.log(self.p, out=self.p.copy(), where=self._logs)
+        values = dict(zip(model.names, own, strict=True))
         if any(name not in values for name in names):
-            change = np.linalg.lstsq(model.rest_basis, self.rest - other.rest, rcond=None)[0]
-            values |= {f"rest_curvature[{k}]": x for k, x in enumerate(change)}
+            rest = np.linalg.lstsq(model.rest_basis, self.rest, rcond=None)[0]
+            values |= {f"rest_curvature[{k}]": x for k, x in enumerate(rest)}
         return np.array([values[name] for name in names])
 
-    @property
+    @cached_property
+    def are_logs(self) -> BoolArray:
+        """Whether each unknown (n,) is a logarithm."""
+        logs = dict(zip(self.model.names, self._logs, strict=True))
+        return np.array([logs.get(name, False) for name in self.uncertainty.names], dtype=bool)
+
+    @cached_property
     def _logs(self) -> BoolArray:
         """Whether each parameter is Gaussian in its logarithm, as in the fit."""
         return np.array([q.log for q in self.model.parameters], dtype=bool)

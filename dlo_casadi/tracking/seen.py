@@ -72,15 +72,13 @@ class Told:
 
         It is the first-order one times how far nodes turn or stiffnesses change.
         """
-        logs = np.array([q.log for q in self.at.model.parameters])
-        stiff = {n for n, log in zip(self.at.model.names, logs, strict=True) if log}
-        rise = [abs(x) for n, x in zip(self.at.uncertainty.names, step, strict=True) if n in stiff]
-        share = max([*rise, float(np.abs(self.turns @ step).max())])
+        rise = np.abs(step[self.at.are_logs]).max(initial=0.0)
+        share = max(rise, np.abs(self.turns @ step).max())
         return float(share * np.linalg.norm(self.columns @ step)) / 2
 
     def strays(self, now: Known) -> bool:
         """Whether a cable is too far from where this was linearised."""
-        return self.error(now.apart(self.at)) > _LINEAR
+        return self.error(now.unknowns - self.at.unknowns) > _LINEAR
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,7 +209,7 @@ def joined(base: Known, poses: Iterable[Seen], shaper: Shaper) -> Known:
     for told in (one.told for one in poses):
         columns = told.columns @ root
         information += columns.T @ columns
-        slope += columns.T @ (told.residual + told.columns @ told.at.apart(base))
+        slope += columns.T @ (told.residual + told.columns @ (told.at.unknowns - base.unknowns))
     after = base.at(shaper.ways(base), root @ np.linalg.solve(information, slope))
     return after.with_root(root @ np.linalg.inv(np.linalg.cholesky(information)).T)
 
