@@ -346,7 +346,8 @@ def drift(d: int, runs: int, first: int) -> None:
         rng = np.random.default_rng(first + k)
         own = uncertain(rope(d, "none"), {name: 0.05 * STIFFNESS}).tracker(STD)
         own.update(seen(rope(d, "none"), next(wandering(d, rng)), rng))
-        alone = (own.params[name].std ** -2 - (0.05 * STIFFNESS) ** -2) ** -0.5
+        after = own.params[name]  # Gaussian in its logarithm
+        alone = STIFFNESS * ((after.std / after.value) ** -2 - 0.05**-2) ** -0.5
         balanced = float(np.cbrt(2 * fall[1] ** 2 * alone))
         walk = 0.2 * far * np.random.default_rng((first + k, 1)).normal(size=n)  # of its own seed
         tried = {

@@ -129,6 +129,20 @@ def test_a_point_that_is_seen_wrong_changes_nothing() -> None:
     assert tracker.params["bending_stiffness"] == before
 
 
+def test_a_cable_that_was_touched_is_caught_again() -> None:
+    """As if it had moved on by 0.3 s within an instant."""
+    tracker, refused = tracked(rope()), []
+    for k in range(46, 100, 2):
+        later = k + 30 * (k >= 80)
+        pose = held(float(T[later]), seen()[1][later])
+        update = tracker.advance(float(T[k]), pose, begins="moving")
+        refused.append(update.refused)
+        assert update.number == len(refused)
+    assert np.flatnonzero(refused).tolist() == [17, 18, 19]
+    ahead = tracker.ahead(0.99, at=S)
+    assert np.abs(seen()[0][129] - ahead.points[0]).max() < 2e-3
+
+
 def test_it_goes_on_at_rest_with_what_motion_told() -> None:
     tracker = tracked(rope())
     for k in range(0, 60, 4):
@@ -191,6 +205,8 @@ def test_errors_tell_numbers_and_what_to_try() -> None:
         tracker.ahead(0.2, [held(0.2), held(0.3)])
     with pytest.raises(dlo.DloError, match=r"0 to 0\.6 m"):
         tracker.ahead(0.2, at=[0.7])
+    with pytest.raises(dlo.DloError, match="numbers belong here"):
+        tracker.ahead("soon")
     with pytest.raises(MotionError, match="Try: fixtures that stay"):
         tracker.advance(1e-3, dlo.Pose(start=(80.0, 0.0), start_heading=-0.8))
     assert tracker.params["bending_stiffness"] == known

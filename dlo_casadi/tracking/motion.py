@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config import Pose
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import DloError
@@ -16,6 +17,7 @@ from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.tracking.known import Known
 from dlo_casadi.tracking.measured import Measured, Noise
 from dlo_casadi.tracking.moving import FIRST_SEEN, InMotion, Sample, Seen
+from dlo_casadi.tracking.seen import IN_A_ROW
 from dlo_casadi.tracking.update import Ahead, Update
 
 
@@ -31,6 +33,7 @@ class TrackerInMotion:
 
     _motion: InMotion | None
     _first: list[Sample]  # of a motion whose first state is not known yet
+    _lost: list[Sample]  # the last instants, if they were refused
     _instants: int
 
     def _learn_in_motion(self, known: Known) -> None:
@@ -38,7 +41,7 @@ class TrackerInMotion:
 
     def _end_motion(self) -> None:
         """The cable is at rest."""
-        self._motion, self._first, self._instants = None, [], 0
+        self._motion, self._first, self._lost, self._instants = None, [], [], 0
 
     def advance(
         self, t: float, pose: Pose, *, begins: Literal["at_rest", "moving"] = "at_rest"
@@ -49,6 +52,8 @@ class TrackerInMotion:
         and the first state), is corrected with them by an extended Kalman filter, see `InMotion`.
         What earlier instants told is kept in the covariance alone. Times may be uneven. `update`
         ends the motion: the cable is at rest in its pose, and goes on with what motion has told.
+        Three refused instants in a row mean that the cable was touched: its state is sought anew,
+        as that of a cable that moves already.
 
         Parameters
         ----------
@@ -80,12 +85,17 @@ class TrackerInMotion:
             raise DloError(f"begins: 'at_rest' or 'moving' belongs here, found {begins!r}")
         sample = self._sample(t, pose, "advance")
         if self._motion is None:
-            return self._begun(sample, at_rest=begins == "at_rest")
+            return self._begun(sample, at_rest=begins == "at_rest" and not self._first)
         walked = np.array([self.drift.get(x, 0.0) for x in self._known.uncertainty.names])
         now = self._motion.faded(self.forget, walked).ahead(sample.t, sample.pose)
         if not sample.measured.size:
             return self._moved(now, None)
-        return self._moved(*now.learned(sample.measured))
+        now, seen = now.learned(sample.measured)
+        self._lost = [*self._lost, sample] if seen.refused else []
+        told = self._moved(now, seen)
+        if len(self._lost) == IN_A_ROW and all(one.measured.marked for one in self._lost):
+            self._motion, self._first, self._lost = None, self._lost, []
+        return told
 
     def ahead(
         self, t: ArrayLike, poses: Sequence[Pose] | None = None, at: ArrayLike | None = None
@@ -112,8 +122,8 @@ class TrackerInMotion:
             said = f"wait until {FIRST_SEEN:g} s are seen" if self._first else "advance(t, pose)"
             raise DloError(f"ahead: no motion has begun.\n  Try: {said}")
         length, last = self._known.model.cable.length, self._motion.rows[-1][1]
-        times = np.atleast_1d(np.asarray(t, dtype=float))
-        s = np.linspace(0.0, length, 21) if at is None else np.atleast_1d(np.asarray(at, float))
+        times = _numbers("ahead", t)
+        s = np.linspace(0.0, length, 21) if at is None else _numbers("at", at)
         if not ((s >= 0) & (s <= length)).all():
             raise DloError(
                 f"at: arc lengths from 0 to {length:g} m belong here, found {s.tolist()}"
@@ -154,19 +164,28 @@ class TrackerInMotion:
         first = [*self._first, sample]
         if not at_rest and sample.t - first[0].t < FIRST_SEEN * (1 - 1e-9):
             self._first = first
-            return Update(len(first), np.zeros(0), 0.0, 1.0, False, None, 0)
+            return self._moved(None, None)
         now = InMotion.begun(self._known, first, at_rest=at_rest, compiled=self.compiled)
-        self._first, self._instants = [], len(first) - 1
+        self._first = []
         return self._moved(now, None)
 
-    def _moved(self, now: InMotion, seen: Seen | None) -> Update:
+    def _moved(self, now: InMotion | None, seen: Seen | None) -> Update:
         """What an instant told."""
         self._motion, self._instants = now, self._instants + 1
-        self._learn_in_motion(now.known)
+        if now is not None:
+            self._learn_in_motion(now.known)
         if seen is None:
             return Update(self._instants, np.zeros(0), 0.0, 1.0, False, None, 0)
         told = seen.innovation, seen.rms, seen.probability, seen.refused
         return Update(self._instants, *told, None, 1)
+
+
+def _numbers(name: str, given: ArrayLike) -> FloatArray:
+    """Numbers in a row."""
+    try:
+        return np.atleast_1d(np.asarray(given, dtype=float)).ravel()
+    except (TypeError, ValueError):
+        raise DloError(f"{name}: numbers belong here, found {given!r}") from None
 
 
 def _check_later(asked: str, t: object, last: float | None) -> None:

@@ -44,6 +44,8 @@ _ITERATIONS, _SMALL = 15, 0.1
 _LINEAR = 0.005
 # Probability of a pose by chance below which it is refused.
 OUTLIER = 1e-5
+# So many poses in a row that are refused are a change.
+IN_A_ROW = 3
 
 
 @dataclass(frozen=True, eq=False)

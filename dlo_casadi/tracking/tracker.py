@@ -27,12 +27,10 @@ from dlo_casadi.tracking.inquiry import JUDGED, Change, Inquiry
 from dlo_casadi.tracking.known import Known
 from dlo_casadi.tracking.measured import Noise
 from dlo_casadi.tracking.motion import TrackerInMotion
-from dlo_casadi.tracking.seen import Seen, joined, learned, smoothed
+from dlo_casadi.tracking.seen import IN_A_ROW, Seen, joined, learned, smoothed
 from dlo_casadi.tracking.shaper import Shaper
 from dlo_casadi.tracking.update import Update
 
-# So many poses in a row that are refused are a change.
-IN_A_ROW = 3
 # Clean poses between false alarms, on average at least; half of them are of each test.
 BETWEEN_ALARMS = 1e4
 # Variance of the whitened innovations that Page's test expects after a change.
