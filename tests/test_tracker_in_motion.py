@@ -11,9 +11,11 @@ from scipy.optimize import least_squares
 
 import dlo_casadi as dlo
 from dlo_casadi.cable.tracked import known_of, with_known
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import MotionError
 from dlo_casadi.estimation.motion_fit import MESH_ERROR
 from dlo_casadi.estimation.motion_told import REPEATED
+from dlo_casadi.motion.path import FixturePath
 from dlo_casadi.tracking.tracker import Tracker
 
 STD, S, LENGTH = 4e-4, np.linspace(0.05, 0.6, 8), 0.6
@@ -166,6 +168,21 @@ def test_what_is_known_fades_and_walks() -> None:
     walked = sum(1e-6 * 0.9**-k for k in range(4))
     size = np.sqrt(SIZES[1] ** 2 * faded + walked)
     assert tracker.params["damping_time"].std == pytest.approx(size)
+
+
+def test_a_way_that_goes_on_row_by_row_has_no_jumps_of_velocity() -> None:
+    pose, t = HeldPose(start=(0.0, 0.0), start_heading=-0.8), np.append(T[:20], T[20:60:4])
+    rows = {"start": carried(t)}
+    for k in range(4, len(t)):
+        before, after = (
+            FixturePath.of_last(pose, t[:j], {"start": rows["start"][:j]}) for j in (k, k + 1)
+        )
+        for path in (before, after):
+            assert path.moving["start"](t[k - 1]) == pytest.approx(rows["start"][k - 1])
+        here = t[k - 1 : k]
+        assert before.rates(here, 1) == pytest.approx(after.rates(here, 1), abs=1e-12)
+        true = np.gradient(carried(here + 1e-4 * np.arange(-1, 2)), 1e-4, axis=0)[1]
+        assert np.abs(before.rates(here, 1)[0, 0] - true).max() < 0.05  # m/s, of 0.94
 
 
 def test_space_is_as_the_plane() -> None:

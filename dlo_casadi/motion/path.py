@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from dlo_casadi.arrays import BoolArray, FloatArray
 from dlo_casadi.equilibrium.pose import HeldPose
@@ -17,6 +17,8 @@ from dlo_casadi.rod.quaternions import same_sign
 
 # Time [s] over which a turn is taken for its rate.
 _INSTANT = 1e-6
+# Shortest distance in time of rows that tell a velocity, over that of the last two.
+_EVEN = 0.4
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +29,7 @@ class FixturePath:
     ----------
     pose : HeldPose
         What rests, and all that does not move.
-    moving : dict of CubicSpline
+    moving : dict of CubicSpline or CubicHermiteSpline
         Of "start", "end" [m], "start_frame", "end_frame" (coordinates of a node), those that move.
     """
 
@@ -37,11 +39,21 @@ class FixturePath:
     @classmethod
     def of(cls, pose: HeldPose, t: FloatArray, rows: Mapping[str, FloatArray]) -> FixturePath:
         """A path through rows (T, ...) at times t (T,) [s]; with one row a fixture rests."""
-        rows = {
-            k: same_sign(x) if k.endswith("frame") and x.shape[1] == 4 else x
-            for k, x in rows.items()
-        }
+        rows = _continuous(rows)
         return cls(pose, {k: CubicSpline(t, x) for k, x in rows.items() if len(t) > 1})
+
+    @classmethod
+    def of_last(cls, pose: HeldPose, t: FloatArray, rows: Mapping[str, FloatArray]) -> FixturePath:
+        """The same from the last time but one to the last, while rows arrive.
+
+        A cubic between both rows; their velocities are those of parabolas through the rows until
+        then, so that a way that goes on, row by row, has no jumps of velocity.
+        """
+        ends = {
+            k: CubicHermiteSpline(t[-2:], x[-2:], [_rate(t[:-1], x[:-1]), _rate(t, x)])
+            for k, x in _continuous(rows).items()
+        }
+        return cls(pose, ends)
 
     def rates(self, t: FloatArray, order: int) -> FloatArray:
         """Derivatives (T, 2, d) by time of the places of start and end; zero outside the rows."""
@@ -86,6 +98,27 @@ class FixturePath:
             given = frame if spline is None else node.normalised(spline(t))
             pose[:, at : at + node.coordinates] = given
         return pose, rates
+
+
+def _continuous(rows: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+    """Rows whose quaternions have no jumps of sign."""
+    turned = {k: same_sign(x) for k, x in rows.items() if k.endswith("frame") and x.shape[1] == 4}
+    return {**rows, **turned}
+
+
+def _rate(t: FloatArray, rows: FloatArray) -> FloatArray:
+    """Rate of rows (T, k) at the last time, by a parabola; zero of a single row.
+
+    Its rows are about as far apart as the last two: through uneven ones it overshoots.
+    """
+    chosen = [len(t) - 1]
+    for k in range(len(t) - 2, -1, -1):
+        if len(chosen) < 3 and t[chosen[-1]] - t[k] > _EVEN * (t[-1] - t[-2]):
+            chosen.append(k)
+    if len(chosen) == 1:
+        return np.zeros(rows.shape[1])
+    powers = np.vander(t[chosen] - t[-1], len(chosen), increasing=True)
+    return np.asarray(np.linalg.solve(powers, rows[chosen])[1])
 
 
 def _inside(spline: Any, t: FloatArray) -> BoolArray:

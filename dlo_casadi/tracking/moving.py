@@ -61,14 +61,16 @@ from dlo_casadi.tracking.seen import OUTLIER
 
 # Time [s] over which the first state of a cable that moves already is sought.
 FIRST_SEEN = FIRST_STRETCHES[-1]
-# Rows of the fixtures through which their way is a cubic spline.
-_ROWS = 6
-# Shortest distance in time of earlier rows, over that of the last two.
-_EVEN = 0.4
+# Rows of the fixtures that are kept.
+_ROWS = 8
 # Steps of time in one of a fit, whose points are extrapolated to steps of no length.
 _FINER = 4
 # Smallest standard deviation of a fixture [m, rad]: none is exact.
 _EXACT = 1e-9
+
+
+# Times [s] and what holds the cable then.
+Rows = tuple[tuple[float, HeldPose], ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +134,7 @@ class InMotion:
     root: FloatArray
     still: FloatArray
     t: float
-    rows: tuple[tuple[float, HeldPose], ...]
+    rows: Rows
     now: Instant
     longest: float
     compiled: bool
@@ -197,7 +199,7 @@ class InMotion:
         return begun._with_first_columns(state)._learned_at_once(seen)
 
     def _with_first_columns(self, state: State) -> InMotion:
-        held, numbers = self._given(self.rows)
+        held, numbers = self._given(_path(self.rows, whole=True), self.cable)
         columns = self.recording.first_columns(held, state, numbers, self.t)
         return replace(self, now=replace(self.now, columns=columns))
 
@@ -209,9 +211,9 @@ class InMotion:
         first[n : n + count] = self.own
         z, *_ = np.linalg.lstsq(self.root, first, rcond=None)  # the prior's mean is zero
         now, information, slope = self, np.eye(len(z)), np.zeros(len(z))
-        rows = tuple((one.t, one.pose) for one in seen)
+        path = _path(tuple((one.t, one.pose) for one in seen), whole=True)
         for one in seen:
-            now = now if one is seen[0] else now.ahead(one.t, one.pose, rows)
+            now = now if one is seen[0] else now.ahead(one.t, one.pose, path)
             if one.measured.size:
                 residual, columns, _ = now._told(one.measured)
                 information += columns.T @ columns
@@ -226,23 +228,18 @@ class InMotion:
         """The cable in motion, with its present values."""
         return MovingCable(self.moving.model, self.moving.p, self.moving.rest, self.still)
 
-    def _given(
-        self, rows: Sequence[tuple[float, HeldPose]], cable: MovingCable | None = None
-    ) -> tuple[HeldFixtures, GivenNumbers]:
-        """Fixtures along rows, and the derivatives of what is given by the numbers."""
-        cable = cable or self.cable
-        ways, path = self.recording.ways(cable.model), _path(rows)
+    def _given(self, path: FixturePath, cable: MovingCable) -> tuple[HeldFixtures, GivenNumbers]:
+        """Fixtures along a path, and the derivatives of what is given by the numbers."""
+        ways = self.recording.ways(cable.model)
         by_p, by_rest = self.moving.uncertainty.unknowns_in(cable.model)
         scale = self.moving.scale
         numbers = GivenNumbers(path, ways, cable, by_p * scale, by_rest * scale)
         return HeldFixtures(path, ways, cable, self.own), numbers
 
-    def ahead(
-        self, t: float, pose: HeldPose, rows: tuple[tuple[float, HeldPose], ...] = ()
-    ) -> InMotion:
+    def ahead(self, t: float, pose: HeldPose, path: FixturePath | None = None) -> InMotion:
         """The cable at a later time [s], where its fixtures are as in a pose.
 
-        `rows`: of the fixtures, if they are known until later.
+        `path`: of the fixtures, if it is known until later.
 
         Raises
         ------
@@ -257,8 +254,8 @@ class InMotion:
                 "  Try: metres? The fixtures at this time?",
                 t=t,
             )
-        rows, cable = rows or self._continued(t, pose), self.cable
-        held, numbers = self._given(rows, cable)
+        cable, rows = self.cable, (*self._rows_before(t), (t, pose))
+        held, numbers = self._given(path or _path(rows), cable)
         times, dt = within(self.t, t, self.longest)
         held.prepare(np.array(times), numbers)
         steps = compiled_steps(cable) if self.compiled else Steps(cable)
@@ -278,19 +275,12 @@ class InMotion:
             ) from None
         return replace(self, t=t, rows=rows[-_ROWS:], now=now)
 
-    def _continued(self, t: float, pose: HeldPose) -> tuple[tuple[float, HeldPose], ...]:
-        """The last rows of the fixtures and one more.
-
-        They are about as far apart as the last two: splines through uneven ones overshoot.
-        """
-        rows = self.rows[-1:]
-        for row in self.rows[-2::-1]:
-            rows = (row, *rows) if rows[0][0] - row[0] > _EVEN * (t - self.t) else rows
-        if len(rows) == 1 and self.recording.measured.at_rest:
-            # Fixtures of a cable at rest have rested.
-            (before, held), apart = rows[0], t - rows[0][0]
-            rows = tuple((before - k * apart, held) for k in (2, 1, 0))
-        return (*rows, (t, pose))
+    def _rows_before(self, t: float) -> Rows:
+        """The last rows of the fixtures; those of a cable at rest have rested."""
+        if len(self.rows) > 1 or not self.recording.measured.at_rest:
+            return self.rows
+        ((before, held),) = self.rows
+        return tuple((before - k * (t - before), held) for k in (2, 1, 0))
 
     def faded(self, forget: float, walked: FloatArray) -> InMotion:
         """What is known has faded, and unknowns have walked by standard deviations (n,)."""
@@ -309,8 +299,9 @@ class InMotion:
         cable, c = self.cable, self.now.columns
         assert c is not None
         z, by_place, by_p = cable.handles(self.now.moving.state)
-        _, numbers = self._given(self.rows[-1:], cable)
-        moved = by_place @ both_nodes(cable, c.moved) + by_p @ numbers.p
+        moved = by_place @ both_nodes(cable, c.moved)
+        by_unknowns = self.moving.uncertainty.unknowns_in(cable.model)[0] * self.moving.scale
+        moved[..., : by_unknowns.shape[1]] += by_p @ by_unknowns
         moved = moved.reshape(*z.shape, -1) @ self.root[: moved.shape[-1]]
         h = cable.model.cable.length / cable.n_segments
 
@@ -425,14 +416,13 @@ def _problem(moving: Known, recording: Recording, std: float) -> tuple[Problem, 
     return problem, unknowns.pack(moving.p, coefficients)
 
 
-def _path(rows: Sequence[tuple[float, HeldPose]]) -> FixturePath:
-    """The way of the fixtures through rows."""
-    last, t = rows[-1][1], np.array([t for t, _ in rows])
+def _path(rows: Rows, *, whole: bool = False) -> FixturePath:
+    """The way of the fixtures from the last row but one to the last, or through all (`whole`)."""
+    t, last = np.array([t for t, _ in rows]), rows[-1][1]
     places = {x: [getattr(pose, x) for _, pose in rows] for x in ("start", "end")}
-    known = {x: np.array(row) for x, row in places.items() if row[0] is not None}
+    known = {x: np.array(row, dtype=float) for x, row in places.items() if row[0] is not None}
     frames = np.array([pose.frames for _, pose in rows])
     frames = np.unwrap(frames, axis=0) if frames.shape[2] == 1 else frames
     known |= {f"{x}_frame": frames[:, k] for k, x in enumerate(("start", "end"))}
-    return FixturePath.of(
-        last, t, {x: row for x, row in known.items() if np.ptp(row, axis=0).any()}
-    )
+    moving = {x: row for x, row in known.items() if np.ptp(row, axis=0).any()}
+    return (FixturePath.of if whole else FixturePath.of_last)(last, t, moving)
