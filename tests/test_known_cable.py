@@ -28,6 +28,7 @@ ROPE = dlo.Cable(length=0.8, mass=0.05, diameter=0.005, bending_stiffness=0.01, 
 WIRE = dlo.Cable(
     length=0.8, mass=0.05, diameter=0.005, bending_stiffness=0.01, torsional_stiffness=0.008
 )
+QUICK = ("-O0",)  # for the compiler
 PINNED = {"gravity": (0, -9.81), "boundary": ("pinned", "pinned")}
 FREE = {"gravity": (0, -9.81), "boundary": ("clamped", "free")}
 WEIGHTLESS = {"gravity": (0, 0), "boundary": ("clamped", "free")}
@@ -115,7 +116,7 @@ def test_two_masses_pull_like_two_forces_of_their_weights(tmp_path):
     for cable in (two, loaded):
         assert cable.solve(end=(0.5, 0.1)).end_force == pytest.approx(force, rel=1e-9)
     row = [0.0, 0.0, 0.5, 0.1, 0.0, 0.0]
-    shapes, _ = loaded.compile().solve_many(np.array([row]))
+    shapes, _ = loaded.compile(flags=QUICK).solve_many(np.array([row]))
     assert shapes["end_force"][0] == pytest.approx(force, rel=1e-8)
 
 
@@ -183,14 +184,14 @@ def test_it_is_what_a_fit_returns(rope, fewer_starts, tmp_path):
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
 def test_its_compiled_solver_finds_its_shape(rope):
-    found = rope.compile().solve(dlo.Pose((0, 0), (0.5, 0.1)))
+    found = rope.compile(flags=QUICK).solve(dlo.Pose((0, 0), (0.5, 0.1)))
     assert found.end_force == pytest.approx(rope.solve(end=(0.5, 0.1)).end_force, rel=1e-6)
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
 def test_a_compiled_solver_is_pickled_and_copied(rope):
     """The C is made again: to the last digit the same shapes, in another process as well."""
-    solver, pose = rope.compile(flags=("-O0",)), dlo.Pose((0, 0), (0.5, 0.1))
+    solver, pose = rope.compile(flags=QUICK), dlo.Pose((0, 0), (0.5, 0.1))
     points = solver.solve(pose).points
     for other in (pickle.loads(pickle.dumps(solver)), copy.copy(solver)):
         assert np.array_equal(other.solve(pose).points, points)
@@ -552,7 +553,7 @@ def test_a_heading_of_which_rounding_leaves_nothing_is_refused():
     """In Python and in C alike; at 1e20 rad neighbouring doubles are 16384 rad apart."""
     cable = dlo.known_cable(ROPE, **FREE, model={"n": 8})
     rows = np.array([[0, 0, 0, 0, x, 0] for x in (1e6, 1.1e6, 1e20)])
-    shapes, statuses = cable.compile().solve_many(rows)
+    shapes, statuses = cable.compile(flags=QUICK).solve_many(rows)
     assert statuses.tolist() == [0, 6, 6]
     assert not shapes["energy"][1:].any()
     assert cable.solve(start_heading=1e6).stable

@@ -51,7 +51,7 @@ VALUES = {
 CASES = [
     (2, "clamped", "free"),
     (2, "pinned", "pinned"),
-    (2, "clamped", "clamped"),
+    pytest.param((2, "clamped", "clamped"), marks=pytest.mark.long, id="2, clamped to clamped"),
     (3, "pinned", "pinned"),
     pytest.param((3, "clamped", "free"), marks=pytest.mark.long, id="3, clamped to free"),
     (3, "clamped", "swivel"),
@@ -314,7 +314,8 @@ def test_the_step_in_casadi_is_that_of_python(case, tmp_path):
     state = cable.at_rest(eq, still)
     state = state_vector(Moving(state, np.hstack([state.alpha, state.a])))
     rng, function = np.random.default_rng(0), step_function(cable, DT)
-    for _ in range(3):
+    both = external.jacobian(), function.jacobian()
+    for _ in range(2):
         own = fixtures_vector(cable, still)
         own[: 2 * cable.d] += 1e-4 * rng.normal(size=2 * cable.d)
         found, expected = external(state, own), function(state, own)
@@ -323,8 +324,7 @@ def test_the_step_in_casadi_is_that_of_python(case, tmp_path):
         for value, other in zip(found[:4], expected, strict=False):
             scale = max(float(np.abs(np.array(other)).max()), 1.0)
             np.testing.assert_allclose(np.array(value), np.array(other), atol=1e-6 * scale)
-        slopes = external.jacobian()(state, own, *found)
-        known = function.jacobian()(state, own, *expected)
+        slopes, known = both[0](state, own, *found), both[1](state, own, *expected)
         along = along_unit_frames(model, state)
         for k in range(8):
             slope, other = np.array(slopes[k]), np.array(known[k])

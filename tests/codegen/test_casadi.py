@@ -45,7 +45,10 @@ def cable(where, **options):
         ("plane", None, {"start": "clamped", "end": "clamped", "effects": (ClampCompliance(),)}),
         ("plane", "cw", {}),
         ("space", None, {"start": "clamped", "end": "clamped", "effects": (ClampRotation(),)}),
-        ("space", None, {"start": "clamped", "end": "swivel", "effects": (ClampRotation(),)}),
+        pytest.param(
+            *("space", None, {"start": "clamped", "end": "swivel", "effects": (ClampRotation(),)}),
+            marks=pytest.mark.long,
+        ),
         ("space", None, {"start": "swivel", "end": "clamped", "effects": (ClampCompliance(),)}),
         ("space", None, {"start": "swivel", "end": "swivel"}),
     ],

@@ -132,7 +132,14 @@ def test_two_pinned_clips_in_a_plane():
     assert_agree(solver.solve(pose), solve_equilibrium(model, p, rest, pose))
 
 
-@pytest.mark.parametrize("held", [{}, {"start": "pinned", "end": "pinned"}, {"end": "free"}])
+@pytest.mark.parametrize(
+    "held",
+    [
+        pytest.param({}, marks=pytest.mark.long),
+        {"start": "pinned", "end": "pinned"},
+        {"end": "free"},
+    ],
+)
 def test_clips_in_a_plane(held):
     """One of each kind: a saddle, an eyelet, a pinned one."""
     eyelet = HeldClip("eyelet", (0.42, 0.12))
@@ -169,9 +176,9 @@ def test_a_cable_in_a_plane_that_stretches():
     [
         ((SADDLE, CLIPS[1]), {"start": "pinned"}),
         ((SWIVEL,), {"end": "free"}),
-        ((CLIPS[0], EYELET), {"end": "pinned"}),
+        pytest.param((CLIPS[0], EYELET), {"end": "pinned"}, marks=pytest.mark.long),
         ((SADDLE, EYELET), {}),
-        ((CLIPS[0], NEARBY), {"end": "pinned"}),
+        pytest.param((CLIPS[0], NEARBY), {"end": "pinned"}, marks=pytest.mark.long),
         ((HeldClip("eyelet", CLIPS[0].place), NEARBY), {}),
     ],
 )

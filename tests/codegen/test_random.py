@@ -33,7 +33,9 @@ def any_cable(rng, element="link"):
     return SOLVERS[element]
 
 
-@pytest.mark.parametrize("element", ["link", "arc", "quadratic"])
+@pytest.mark.parametrize(
+    "element", ["link", pytest.param("arc", marks=pytest.mark.long), "quadratic"]
+)
 def test_random_cables_have_stable_equilibria(element):
     rng = np.random.default_rng(2)
     solver = any_cable(rng, element)
@@ -90,7 +92,7 @@ def test_a_named_branch_is_found_where_there_is_one_and_never_the_other(branch):
         pytest.param("pinned", "clamped", marks=pytest.mark.long),
         ("clamped", "pinned"),
         pytest.param("clamped", "clamped", marks=pytest.mark.long),
-        ("pinned", "pinned"),
+        pytest.param("pinned", "pinned", marks=pytest.mark.long),
     ],
 )
 def test_24_random_starts_find_nothing_lower(start, end):

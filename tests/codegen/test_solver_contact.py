@@ -75,7 +75,7 @@ def at_nodes(d: int, end: str = "clamped") -> CompiledSolver:
     [
         ("table", 2, "clamped"),
         ("table", 3, "free"),
-        ("table", 3, "clamped"),
+        pytest.param("table", 3, "clamped", marks=pytest.mark.long),
         ("ball", 3, "clamped"),
     ],
 )
@@ -116,7 +116,7 @@ def test_a_place_slides_to_where_the_cable_is_lowest(own):
     assert solver.clearance(shape, solver.obstacles).distance == pytest.approx(0.0, abs=1e-9)
 
 
-@pytest.mark.parametrize("mass", [0.05, 0.5])
+@pytest.mark.parametrize("mass", [pytest.param(0.05, marks=pytest.mark.long), 0.5])
 def test_cables_in_the_plane_land_on_tables(mass):
     """Also heavy ones, whose mesh is coarse: they slide until they lie."""
     model = replace(cable(2), cable=CableData(1.0, mass, 0.008, 0.01))

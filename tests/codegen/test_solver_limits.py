@@ -67,7 +67,13 @@ def ball_beside(shape):
     return [Capsule(middle, middle, 0.03), Plane(tuple(-0.6 * np.array(down)), down)]
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(x, marks=pytest.mark.long) if x in ("space", "space, pinned") else x
+        for x in CASES
+    ],
+)
 def test_values_and_places_are_those_of_python(case):
     model, pose = CASES[case]()
     solver, p, rest = compiled(model)

@@ -127,7 +127,10 @@ def drawn(*choice):
         return simulated(*choice)
 
 
-@pytest.fixture(scope="module", params=["clamp_angle", "length_error"])
+@pytest.fixture(
+    scope="module",
+    params=["clamp_angle", pytest.param("length_error", marks=pytest.mark.long)],
+)
 def varied(request):
     """A session in the plane whose clamps turn, or lengths differ, with its declared fit."""
     found = drawn(generator_of(7, 1), 2, 0, request.param)

@@ -126,6 +126,7 @@ def test_still_shapes_predict_frequencies_that_the_motions_meet(
     assert modes.as_rows()[0]["of"] == "carry"
 
 
+@pytest.mark.long
 def test_drag_of_air_is_found(at_rest: Fit) -> None:
     before = fitted(at_rest, drag=3.0)
     found = search_in_motion(before)

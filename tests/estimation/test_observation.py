@@ -301,7 +301,13 @@ def test_directions_that_leave_a_photograph_alone_tell_nothing_of_its_noise():
     assert np.isfinite(estimate_noise([*samples, *still], LENGTH).std)
 
 
-@pytest.mark.parametrize("truth", NOISES[1:], ids=lambda noise: noise.kernel)
+@pytest.mark.parametrize(
+    "truth",
+    [
+        pytest.param(x, id=x.kernel, marks=[pytest.mark.long] * (x.kernel == "gaussian"))
+        for x in NOISES[1:]
+    ],
+)
 def test_correlated_noise_is_recovered(truth):
     """Size and correlation over the distances that points and knots are apart, from 60 poses."""
     found = [estimate_noise(simulated(truth, poses=60, seed=k), LENGTH) for k in range(3)]

@@ -363,7 +363,12 @@ def round_trip(element: str, markers: bool = False):
 
 @pytest.mark.parametrize(
     ("element", "markers"),
-    [("quadratic", False), ("arc", False), ("link", False), ("quadratic", True)],
+    [
+        ("quadratic", False),
+        ("arc", False),
+        pytest.param("link", False, marks=pytest.mark.long),
+        ("quadratic", True),
+    ],
 )
 def test_round_trip_with_noise_within_three_sigma(element, markers):
     """Parameters -> poses -> noise -> the same parameters; the prior of EI is off by 1.8."""

@@ -41,21 +41,21 @@ def photographs(names):
 
 def in_space(names):
     """Configuration of a quick run of a few poses of configs/markers_in_space.yaml."""
-    return some("markers_in_space", names)
+    return some("markers_in_space", names, n=10)
 
 
-def some(session, names):
+def some(session, names, n=20):
     """Configuration of a quick run of a few poses of a session in configs."""
     config = load_config(CONFIGS / f"{session}.yaml")
     poses = tuple(pose for pose in config.experiment.poses if pose.name in names)
     experiment = config.experiment.changed(poses=poses)
-    return quick(config.changed(experiment=experiment))
+    return quick(config.changed(experiment=experiment), n)
 
 
-def quick(config):
+def quick(config, n=20):
     """The same session on a coarse mesh, without the parts that take time."""
     return config.changed(
-        model=config.model.changed(n=20),
+        model=config.model.changed(n=n),
         estimation=config.estimation.changed(algorithm1=False),
         diagnosis=config.diagnosis.changed(enabled=False),
     )

@@ -52,7 +52,7 @@ def repeats(model, p, poses, scatter, marked, rng, near=None):
     ("model", "marked"),
     [
         pytest.param(PLANE, False, id="plane-lines"),
-        pytest.param(PLANE, True, id="plane-markers"),
+        pytest.param(PLANE, True, id="plane-markers", marks=pytest.mark.long),
         pytest.param(SPACE, False, id="space-lines", marks=pytest.mark.long),
         pytest.param(SPACE, True, id="space-markers"),
     ],

@@ -193,7 +193,7 @@ def table():
     cable["rest_shape"] = "straight"
     desk = {"name": "desk", "kind": "plane", "point": [0.0, level], "normal": [0.0, 1.0]}
     experiment = lines(("clamped", "free"), obstacles=[desk])
-    options = quick(16, "obstacle_offset", "clamp_angle", "gravity_tilt")
+    options = quick(12, "obstacle_offset", "clamp_angle", "gravity_tilt")
     session = Writer("table", 5, cable, experiment, options, count=16, markers=True)
     for k, (height, heading) in enumerate(
         ((0.09, -0.3), (0.11, 0.0), (0.16, -0.9), (0.13, -0.6), (0.1, -0.2))
