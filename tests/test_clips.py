@@ -236,7 +236,7 @@ def test_ipopt_finds_the_same_minimum(second):
 def test_ipopts_statement_in_space_has_the_same_energy_and_conditions():
     """Through a swivel, whose frame rolls with the cable, and an eyelet."""
     model, pose, eq = solved(
-        IN_SPACE, (0.7, 0.2, 0.1), 10, LOOM, gravity=(0.0, 0.0, -9.81), start="clamped",
+        IN_SPACE, (0.7, 0.2, 0.1), 20, LOOM, gravity=(0.0, 0.0, -9.81), start="clamped",
         start_orientation=turned(0, 0.2, 0.1),
     )  # fmt: skip
     given = Inputs.of(model.nominal, np.zeros(model.chain.n_rests), pose.vector[None])

@@ -302,7 +302,7 @@ def along_unit_frames(model, state):
 @pytest.mark.parametrize("case", [(2, "pinned", "clamped"), (3, "clamped", "pinned")])
 def test_the_step_in_casadi_is_that_of_python(case, tmp_path):
     """Value and Jacobian; both steps end within 1e-9, Python's Jacobian is that of its own end."""
-    model = model_of(*case, n=4)
+    model = model_of(*case, n=6)
     model = replace(model, effects=tuple(x for x in model.effects if x.label != "tether"))
     p, rest = values_of(model), np.zeros(model.chain.n_rests)
     source = generate(model, p, rest, "rope", motion=True)

@@ -25,7 +25,7 @@ def random(*sizes):
         (node._frame_difference, (4, 4)),
         (elements._between, (4, 4)),
         (elements._turned, (3, 1)),
-        (elements._bowed, (7, 3, 1, 1, 1)),
+        (elements._bowed, (7, 3, 1, 1, 1, 1)),
         (elements.inverse_of, ((3, 3),)),
         (in_frame._rotation, (4,)),
     ],
