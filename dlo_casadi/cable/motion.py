@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from os import PathLike
@@ -24,7 +24,14 @@ from dlo_casadi.cable.moving_picture import (
     moving_picture,
 )
 from dlo_casadi.cable.saved import parameters_hash
-from dlo_casadi.cable.shape_in_motion import POINTS, ShapeInMotion, moving_cable
+from dlo_casadi.cable.shape_in_motion import (
+    POINTS,
+    ShapeInMotion,
+    anchors_of,
+    moving_cable,
+    nodes_of,
+)
+from dlo_casadi.config import Clip
 from dlo_casadi.effects import IN_MOTION
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
@@ -82,6 +89,13 @@ class Motion:
     def end_force(self) -> FloatArray:
         """Force (T, d) [N] of the cable on whatever holds its end; zero at a free end."""
         return self.way.at(self.t, self.way.forces[1])
+
+    @cached_property
+    def clip_forces(self) -> dict[str, FloatArray]:
+        """Forces (T, d) [N] of the cable on its clips, by their names."""
+        found = self.way.at(self.t, self.way.clip_forces)
+        names = (clip.name for clip in self.way.path.pose.clips)
+        return dict(zip(names, np.moveaxis(found, 1, 0), strict=True))
 
     @cached_property
     def energy(self) -> FloatArray:
@@ -201,7 +215,8 @@ class CableInMotion(EstimatedCable):
         ----------
         dt : float [s]
         about : Shape, optional
-            The shape at rest from which changes count, if the cable is stiffer in motion.
+            The shape at rest from which changes count, if the cable is stiffer in motion; clips
+            hold the cable as in this shape.
 
         Returns
         -------
@@ -224,10 +239,12 @@ class CableInMotion(EstimatedCable):
         """
         if not (isinstance(dt, int | float) and np.isfinite(dt) and dt > 0):
             raise DloError(f"dt: a time [s] above zero belongs here, found {dt!r}")
-        moving = moving_cable(self)
         if about is not None:
-            moving = moving.about(about.equilibrium.x)
-        elif moving.segment.stiffens:
+            held = self.with_clips([clip.kind for clip in about.pose.clips])
+            moving = moving_cable(held, (about.equilibrium, about.pose))
+            return step_function(moving.about(about.equilibrium.x), float(dt))
+        moving = moving_cable(self)
+        if moving.segment.stiffens:
             raise DloError(
                 "step: the stiffness in motion acts on changes from a shape at rest.\n"
                 "  Try: cable.step(dt, about=shape)"
@@ -244,6 +261,7 @@ class CableInMotion(EstimatedCable):
         end_heading: ArrayLike | None = None,
         start_orientation: ArrayLike | None = None,
         end_orientation: ArrayLike | None = None,
+        clips: Sequence[Clip | Mapping[str, Any]] = (),
         begins: ShapeInMotion | Motion | None = None,
         tolerance: float = TOLERANCE,
     ) -> Motion:
@@ -258,10 +276,13 @@ class CableInMotion(EstimatedCable):
             Places of the fixtures, smooth between the times; otherwise as in `solve`.
         start_heading, end_heading : float or (T,) [rad]
         start_orientation, end_orientation : (4,) or (T, 4)
+        clips : sequence of Clip or dict
+            Clips between the ends, at rest: pinned, clamped or swivel.
         begins : Shape or Motion, optional
             The shape from which the cable is let go, with no velocity: of this cable or of another
             one of the same length, held in any way. Or a motion that is continued from its last
-            state. By default the equilibrium at the first instant.
+            state, held by the same clips or by none. By default the equilibrium at the first
+            instant.
         tolerance : float
             Largest error of the places in one step over the length.
 
@@ -278,13 +299,15 @@ class CableInMotion(EstimatedCable):
         asked: dict[str, Any] = {"start": start, "end": end}
         asked |= {"start_heading": start_heading, "end_heading": end_heading}
         asked |= {"start_orientation": start_orientation, "end_orientation": end_orientation}
-        pose, path = fixture_path(self, times, asked)
-        cable = moving_cable(self)
-        rest = solve_equilibrium(cable.model, cable.p, cable.rest, pose)
-        cable = cable.about(rest.x)
-        state = _begun(self, cable, pose, rest, begins)
+        pose, path = fixture_path(self, times, {**asked, "clips": clips})
+        held = self.with_clips([clip.kind for clip in pose.clips])
+        rest = solve_equilibrium(held.model, held.p, held.rest, pose)
+        cable = moving_cable(held, (rest, pose))
+        own, cable = cable.along, _on_the_mesh_of(begins, cable)
+        cable = cable.about(cable.model.node.interpolated(cable.along, own, rest.x))
+        state = _begun(held, cable, pose, rest, begins)
         way = way_of(cable, state, path, (times[0], times[-1]), tolerance)
-        return Motion(self, times, way)
+        return Motion(held, times, way)
 
 
 def fixture_path(
@@ -294,9 +317,11 @@ def fixture_path(
 
     `asked`: places and directions as in `CableInMotion.simulate`. Raises DloError if they are none.
     """
+    asked = dict(asked)
+    clips = asked.pop("clips", ())
     rows = {key: _rows(key, x, len(times)) for key, x in asked.items() if x is not None}
     first = {key: (x[0] if x.ndim > 1 else x) for key, x in rows.items()}
-    given = dict.fromkeys((*HELD, "clips"))
+    given = {**dict.fromkeys(HELD), "clips": clips}
     numbers = {k: float(x[0]) if k.endswith("heading") else x for k, x in first.items()}
     pose = held_pose(cable.model, cable.metadata.fixtures, {**given, "turns": 0.0, **numbers})
     direction = cable.model.node.direction
@@ -348,16 +373,52 @@ def _begun(
         return moving.at_rest(rest, moving.fixtures(pose.vector))
     if not isinstance(begins, ShapeInMotion):
         raise DloError(f"begins: a shape or a motion belongs here, found {begins!r}")
-    x, places = begins.equilibrium.x, moving.model.chain.places
+    x, places = begins.equilibrium.x, moving.along
     if x.shape[1] != moving.model.node.coordinates:
         raise DloError("begins: a shape in space cannot move in a plane, nor the reverse")
-    known = np.linspace(0.0, cable.length, len(x))
+    known, points = nodes_of(begins)
     nodes = moving.model.node.interpolated(places, known, x)
+    if moving.anchors is not None:
+        nodes = moving.anchors.held(nodes)
+    near = CubicSpline(known, points)(places)
     _check_ends(moving, pose, begins, nodes)
-    near = CubicSpline(known, begins.equilibrium.points)(places)
+    _check_clips(moving, pose, near)
     force = np.zeros((moving.n_segments, moving.d * (1 + 2 * moving.model.n_springs)))
     state = moving.still_state(nodes, force, np.zeros(moving.n_moments))
     return moving.with_places(state, moving.fixtures(pose.vector), near)
+
+
+def _on_the_mesh_of(begins: ShapeInMotion | Motion | None, cable: MovingCable) -> MovingCable:
+    """The cable on the nodes from which it begins, if no clip needs others.
+
+    Raises DloError if a motion is continued with other clips.
+    """
+    own, before = cable.anchors, None
+    if isinstance(begins, Motion):
+        before = begins.way.cable.anchors
+        if own is not None and not (before is not None and own.like(before)):
+            raise DloError(
+                "begins: a motion is continued with the clips that it has, or without any.\n"
+                "  Try: the same clips."
+            )
+    elif isinstance(begins, ShapeInMotion) and begins.cable.model.clips:
+        before = anchors_of(begins)
+    if own is not None or before is None or len(before.along) != cable.n_nodes:
+        return cable
+    return MovingCable(cable.model, cable.p, cable.rest, anchors=before.released())
+
+
+def _check_clips(moving: MovingCable, pose: HeldPose, near: FloatArray) -> None:
+    """Raise an error if clips hold the cable elsewhere than it is, at nodes `near` [m]."""
+    if moving.anchors is None:
+        return
+    for clip, node in zip(pose.clips, moving.anchors.nodes, strict=True):
+        off = float(np.linalg.norm(near[node] - clip.place))
+        if off > _OFF * moving.model.cable.length:
+            raise DloError(
+                f"begins: at {moving.along[node]:.4g} m the shape is {1e3 * off:.3g} mm from "
+                f"{clip.name}.\n  Try: its place, or a shape that it holds."
+            )
 
 
 def _check_ends(

@@ -16,7 +16,9 @@ from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import DloError
 from dlo_casadi.io.files import write_file
+from dlo_casadi.model.assembly import Assembly, Inputs
 from dlo_casadi.motion import modes_at_rest
+from dlo_casadi.motion.anchors import Anchors
 from dlo_casadi.motion.modes_at_rest import ModesAtRest
 from dlo_casadi.motion.step_function import fixtures_vector, state_vector
 from dlo_casadi.motion.steps import still
@@ -120,10 +122,24 @@ class ShapeInMotion:
         DloError
             If motion does not know a part of the cable.
         """
-        moving = moving_cable(self.cable)
+        moving = moving_cable(self.cable, (self.equilibrium, self.pose))
         fixtures = moving.fixtures(self.pose.vector)
         state = still(moving.at_rest(self.equilibrium, fixtures))
         return state_vector(state), fixtures_vector(moving, fixtures)
+
+
+def nodes_of(shape: ShapeInMotion) -> tuple[FloatArray, FloatArray]:
+    """Arc lengths (n_nodes,) and places (n_nodes, d) [m] of the nodes of a shape."""
+    model, eq = shape.cable.model, shape.equilibrium
+    given = Inputs.of(shape.cable.p, shape.cable.rest, shape.pose.vector[None])
+    found = Assembly(model, eq.shapes, given)
+    return found.clipped.places[0], found.at_nodes()[0][0]
+
+
+def anchors_of(shape: ShapeInMotion) -> Anchors:
+    """What clips hold of a shape, and where its nodes are."""
+    cable = shape.cable
+    return Anchors.of(cable.model, cable.p, cable.rest, shape.equilibrium, shape.pose)
 
 
 def directions(cable: EstimatedCable) -> list[tuple[FloatArray, FloatArray]]:
@@ -131,6 +147,8 @@ def directions(cable: EstimatedCable) -> list[tuple[FloatArray, FloatArray]]:
     return modes_at_rest.directions(cable.model, cable.metadata.uncertainty)
 
 
-def moving_cable(cable: EstimatedCable) -> MovingCable:
-    """The cable in motion, without effects of the camera."""
-    return modes_at_rest.moving_cable(cable.model, cable.p, cable.rest)
+def moving_cable(
+    cable: EstimatedCable, shape: tuple[Equilibrium, HeldPose] | None = None
+) -> MovingCable:
+    """The cable in motion, see `modes_at_rest.moving_cable`."""
+    return modes_at_rest.moving_cable(cable.model, cable.p, cable.rest, shape)

@@ -89,10 +89,15 @@ POSE = (
 )
 
 
+CLIPS_OF_A_POSE = option(
+    "--clips", type=Path, metavar="FILE", help="YAML: a list of clips, as in a pose"
+)
+
+
 @command(
     PARAMETERS,
     *POSE,
-    option("--clips", type=Path, metavar="FILE", help="YAML: a list of clips, as in a pose"),
+    CLIPS_OF_A_POSE,
     OBSTACLES,
     option(
         "--over",

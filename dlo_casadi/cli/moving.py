@@ -10,7 +10,7 @@ from dlo_casadi.cable.file import load
 from dlo_casadi.cable.held import HELD
 from dlo_casadi.cable.moving_table import read_fixtures
 from dlo_casadi.cli.common import PARAMETERS, Page, Watch, command, figure, option
-from dlo_casadi.cli.fitted import OBSTACLES, POSE, listed, named
+from dlo_casadi.cli.fitted import CLIPS_OF_A_POSE, OBSTACLES, POSE, listed, named
 
 DAMPING = option(
     "--damping",
@@ -66,6 +66,7 @@ def damped(chosen: argparse.Namespace) -> Any:
 @command(
     PARAMETERS,
     *POSE,
+    CLIPS_OF_A_POSE,
     DAMPING,
     option("--count", type=int, default=6, metavar="N", help="number of modes (6)"),
     option("--animate", type=Path, metavar="FILE", help="a moving picture of them: modes.svg"),
@@ -79,7 +80,8 @@ def modes(chosen: argparse.Namespace) -> None:
     """
     from dlo_casadi.show.style import save_figure
 
-    shape = damped(chosen).solve(**{name: getattr(chosen, name) for name in HELD})
+    asked = {name: getattr(chosen, name) for name in HELD}
+    shape = damped(chosen).solve(**asked, clips=listed(chosen, "clips"))
     found, page = shape.modes(chosen.count), Page(chosen)
     if chosen.figure is not None:
         save_figure(chosen.figure, found.plot())
@@ -95,6 +97,7 @@ def modes(chosen: argparse.Namespace) -> None:
 @command(
     PARAMETERS,
     option("fixtures", type=Path, help="CSV: t_s and where the fixtures are: start_x_m, ..."),
+    CLIPS_OF_A_POSE,
     DAMPING,
     option("--output", type=Path, metavar="FILE", help="CSV of markers: t_s,s_m,x_m,y_m"),
     option(
@@ -119,7 +122,7 @@ def simulate(chosen: argparse.Namespace) -> None:
 
     cable = damped(chosen)
     t, rows = read_fixtures(cable.model.node, chosen.fixtures)
-    motion, page = cable.simulate(t, **rows), Page(chosen)
+    motion, page = cable.simulate(t, **rows, clips=listed(chosen, "clips")), Page(chosen)
     written = []
     if chosen.figure is not None:
         save_figure(chosen.figure, motion.plot())
@@ -135,18 +138,20 @@ def simulate(chosen: argparse.Namespace) -> None:
         write_file(chosen.output, "\n".join([header, *lines, ""]))
         written.append(f"Markers: {chosen.output}")
     forces = {side: getattr(motion, f"{side}_force") for side in ("start", "end")}
-    largest = {side: float(np.linalg.norm(f, axis=1).max()) for side, f in forces.items()}
+    every = {**{f"its {side}": force for side, force in forces.items()}, **motion.clip_forces}
+    largest = {where: float(np.linalg.norm(f, axis=1).max()) for where, f in every.items()}
     page.data(
         {
             "t": t.tolist(),
             "points": motion.points.tolist(),
             **{f"{side}_force": force.tolist() for side, force in forces.items()},
+            "clip_forces": {name: force.tolist() for name, force in motion.clip_forces.items()},
             "energy": motion.energy.tolist(),
         }
     )
     page.say(f"{cable.name}: {t[0]:g} to {t[-1]:g} s in {len(motion.way.t) - 1} steps")
-    for side, size in largest.items():
-        page.say(f"  largest force on its {side}: {size:.4g} N")
+    for where, size in largest.items():
+        page.say(f"  largest force on {where}: {size:.4g} N")
     for line in written:
         page.say(line)
 

@@ -293,7 +293,7 @@ class Recording:
 
     def _markers(self, cable: MovingCable) -> tuple[IntArray, FloatArray]:
         """Segment of each marker, and its share of it."""
-        low, width = cable.model.chain.layout.segments[:, :2].T
+        low, width = cable.layout[:, :2].T
         s = self.measured.s
         segment = np.clip(np.searchsorted(low, s, side="right") - 1, 0, len(low) - 1)
         return segment, (s - low[segment]) / width[segment]

@@ -260,11 +260,15 @@ class Assembly(Evaluation):
         mean = (rates[:, 1:] + rates[:, :-1]) / 2
         return places, np.concatenate([rates[:, :1], mean, rates[:, -1:]], axis=1)
 
-    def nodes(self) -> FloatArray:
-        """True places (m, n + 1, dimension) [m] of the element boundaries."""
+    def at_nodes(self) -> tuple[FloatArray, FloatArray]:
+        """True places [m] and rates of the element boundaries as they are, see `_stations`."""
         (advance,) = self._call_segments("segment_curve")
+        return self._stations(advance[..., 0], self.given.poses[:, : self.model.node.dimension])
+
+    def nodes(self) -> FloatArray:
+        """True places (m, n + 1, dimension) [m] of the element boundaries, evenly spaced."""
         node, clipped = self.model.node, self.clipped
-        places, rates = self._stations(advance[..., 0], self.given.poses[:, : node.dimension])
+        places, rates = self.at_nodes()
         if not clipped.moved:
             return places
         moved = np.concatenate([places, rates[..., :1] * tangents(node, self.shapes.x)], axis=2)

@@ -210,7 +210,7 @@ class Clipped:
         rows = np.arange(len(x))
         x = x.copy() if self.clamps else x
         for clamp in self.clamps:
-            x[rows, clamp.index] = _alike(clamp.frame, x[rows, clamp.index])
+            x[rows, clamp.index] = alike(clamp.frame, x[rows, clamp.index])
         return x
 
     def free(self, step: FloatArray) -> FloatArray:
@@ -226,8 +226,8 @@ class Clipped:
         c, rows = both.shape[2] // 2, np.arange(len(both))
         for clamp in self.clamps:
             before, after = clamp.index - 1, clamp.index
-            both[rows, before, c:] = _alike(clamp.frame, both[rows, before, :c])
-            both[rows, after, :c] = _alike(clamp.frame, both[rows, after, c:])
+            both[rows, before, c:] = alike(clamp.frame, both[rows, before, :c])
+            both[rows, after, :c] = alike(clamp.frame, both[rows, after, c:])
         return both
 
     def segments(self) -> FloatArray:
@@ -423,7 +423,7 @@ def by_axes(moments: FloatArray, step: FloatArray) -> FloatArray:
     return np.moveaxis(cross(*both), -1, -2) / 2
 
 
-def _alike(frame: FloatArray, beside: FloatArray) -> FloatArray:
+def alike(frame: FloatArray, beside: FloatArray) -> FloatArray:
     """Frames (m, coordinates) with quaternion signs as in `beside`; headings unchanged."""
     if frame.shape[1] == 1:
         return frame

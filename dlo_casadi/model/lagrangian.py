@@ -31,6 +31,7 @@ from dlo_casadi.model.cable_model import (
     CableModel,
 )
 from dlo_casadi.model.clips import clip_size
+from dlo_casadi.rod.chain import moved_rest
 from dlo_casadi.rod.element import LAYOUT_SIZE, Section, Segment
 from dlo_casadi.rod.ends import ClipConditions, EndConditions, held_turns
 
@@ -239,19 +240,13 @@ class Lagrangian:
 
     @property
     def _rest_inside(self) -> ca.SX:
-        """Rest strains (3 strains,) [1/m] inside the segment, whose ends may be moved to clips.
-
-        m + a x + c (x^2 - 1/12) of the even element, |x| <= 1/2, is the same of y at x = x_0 + w y.
-        """
+        """Rest strains (3 strains,) [1/m] inside the segment, whose ends may be moved to clips."""
         if not self.model.moves_nodes:
             return self.rest_strains
         low, high, mesh, even = ca.vertsplit(self.place)
-        x, w, inside = ((low + high) / 2 - even) / mesh - 0.5, (high - low) / mesh, []
-        for own in ca.vertsplit(self.rest_strains, 3):
-            mean, a, c = ca.vertsplit(own)
-            inside += [mean + a * x + c * (x * x + (w * w - 1) / 12)]
-            inside += [w * (a + 2 * c * x), c * w * w]
-        return ca.vertcat(*inside)
+        x, w = ((low + high) / 2 - even) / mesh - 0.5, (high - low) / mesh
+        parts = (moved_rest(own, x, w) for own in ca.vertsplit(self.rest_strains, 3))
+        return ca.vertcat(*(row for part in parts for row in part))
 
     def elastic_energy(self, segment: Segment) -> ca.SX:
         """Energy of bending and twist of a segment [J]."""

@@ -97,7 +97,7 @@ class InertSegment:
     def masses(self) -> list[tuple[ca.SX, ca.SX]]:
         """Compact masses on this segment [kg], zero if they are elsewhere, and their shares."""
         found, start, length = [], self.place[0], self.terms.length
-        last = start + 1.5 * length > self.model.cable.length
+        last = start + (1 + 1e-6) * length > self.model.cable.length
         for effect, local in self.terms.effects_of(Load):
             for one in effect.masses(local):
                 u = (one.position - start) / length

@@ -157,7 +157,7 @@ def displacements(
 
     Displacements are real, at the phase at which they are largest; their largest is 1.
     """
-    places = cable.model.chain.places
+    places = cable.along
     e = np.clip(np.searchsorted(places, s, side="right") - 1, 0, len(places) - 2)
     share = (s - places[e]) / np.diff(places)[e]
     z, by_unknowns, _ = cable.handles(state)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,15 +12,37 @@ from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.equilibrium.spread import Uncertainty
+from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.motion.anchors import Anchors
 from dlo_casadi.motion.modes import DampedModes, damped_modes, displacements
 from dlo_casadi.motion.state import State
 from dlo_casadi.motion.system import MovingCable
 
 
-def moving_cable(model: CableModel, p: FloatArray, rest: FloatArray) -> MovingCable:
-    """The cable in motion, without effects of the camera."""
-    return MovingCable(*model.without_kind(MeasurementEffect, p), rest)
+def moving_cable(
+    model: CableModel,
+    p: FloatArray,
+    rest: FloatArray,
+    shape: tuple[Equilibrium, HeldPose] | None = None,
+) -> MovingCable:
+    """The cable in motion, without effects of the camera; clips hold it as in a shape at rest.
+
+    Raises
+    ------
+    DloError
+        If motion does not know a part of the cable, or if a cable with clips has no shape.
+    """
+    model, p = model.without_kind(MeasurementEffect, p)
+    if not model.clips or shape is None:
+        return MovingCable(model, p, rest)
+    if model.sliding:
+        raise DloError(
+            f"{model.cable.name!r} slides through an eyelet: in motion a clip holds the cable at "
+            "one arc length.\n  Try: pinned, clamped or swivel."
+        )
+    anchors = Anchors.of(model, p, rest, *shape)
+    return MovingCable(replace(model, clips=()), p, rest, anchors=anchors)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +75,8 @@ class ModesAtRest:
         DloError
             If the mesh has fewer modes, or if motion does not know a part of the cable.
         """
-        moving = moving_cable(self.model, self.p, self.rest).about(self.equilibrium.x)
+        shape = self.equilibrium, self.pose
+        moving = moving_cable(self.model, self.p, self.rest, shape).about(self.equilibrium.x)
         fixtures = moving.fixtures(self.pose.vector)
         state = moving.at_rest(self.equilibrium, fixtures)
         return moving, state, damped_modes(moving, state, fixtures, self.count)

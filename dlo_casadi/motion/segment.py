@@ -244,6 +244,9 @@ def refuse_still(model: CableModel) -> None:
     elif not model.chain.kind.smooth:
         what = f"elements of the kind {model.element!r}: try 'quadratic'"
     elif model.clips:
-        what = "clips: a cable in motion is held at its ends alone"
+        what = (
+            "clips: recorded motions, `motion_equations` and generated C know none; "
+            "simulate(..., clips=...), shape.modes() and step(dt, about=shape) do"
+        )
     if what:
         raise DloError(f"{model.cable.name!r} has {what}")

@@ -18,8 +18,8 @@ class Fixtures:
     ----------
     pose : (n_pose,)
         See `HeldPose.vector`.
-    places, velocities, accelerations : (2, dimension) [m, m/s, m/s^2]
-        True ones of the cable's start and end; of a free end they mean nothing.
+    places, velocities, accelerations : (2 + clips, dimension) [m, m/s, m/s^2]
+        True ones of the cable's start and end, then of clips; of a free end they mean nothing.
     """
 
     pose: FloatArray

@@ -46,7 +46,9 @@ def state_vector(moving: Moving) -> FloatArray:
 def fixtures_vector(cable: MovingCable, fixtures: Fixtures) -> FloatArray:
     """Fixtures as `step_function` takes them."""
     pose = fixtures.pose[: EndConditions.size(cable.model.node)]
-    return np.concatenate([pose, fixtures.velocities.ravel(), fixtures.accelerations.ravel()])
+    return np.concatenate(
+        [pose, fixtures.velocities[:2].ravel(), fixtures.accelerations[:2].ravel()]
+    )
 
 
 def step_function(cable: MovingCable, dt: float) -> ca.Function:
@@ -273,7 +275,10 @@ class _Step:
         share = (1 - scheme.alpha_m) * own + scheme.alpha_m * own_0
         changed = (share - scheme.alpha_f * changed_0) / (1 - scheme.alpha_f)
         rates = rates_0 + dt * ((1 - scheme.gamma) * own_0 + scheme.gamma * own)
-        velocities, accelerations = (ca.reshape(one, cable.d, 2) for one in moving)
+        clips = ca.DM.zeros(cable.d, len(self._clips))
+        velocities, accelerations = (
+            ca.horzcat(ca.reshape(one, cable.d, 2), clips) for one in moving
+        )
         x, by = ca.SX.sym("x", self.node.coordinates), ca.SX.sym("by", b)
         turned = ca.Function("turned", [x, by], [self.node.moved(x, by)]).map(cable.n_nodes)
         return _Moved(
@@ -295,14 +300,20 @@ class _Step:
         return list(ca.vertsplit(given, edges))
 
     def _true_places(self, pose: ca.MX) -> ca.MX:
-        """Places (d, 2) of both fixtures, with their errors."""
+        """Places (d, 2 + clips) of both fixtures, with their errors, and of clips."""
         cable, d = self.cable, self.cable.d
         deviation = ca.DM.zeros(len(cable.model.deviation_names))
         true, _ = cable.segment.terms.true_ends_and_length(cable.p, pose, deviation)
-        return ca.reshape(true[: 2 * d], d, 2)
+        return ca.horzcat(ca.reshape(true[: 2 * d], d, 2), ca.DM(self._clips.T))
+
+    @property
+    def _clips(self) -> FloatArray:
+        """Places (clips, d) [m] of clips."""
+        anchors = self.cable.anchors
+        return np.zeros((0, self.cable.d)) if anchors is None else anchors.places
 
     def _with(self, rows: ca.MX, held: ca.MX) -> ca.MX:
-        """Rows (d, n_nodes), at held nodes those of the fixtures."""
+        """Rows (d, n_nodes), at held nodes those of the fixtures: of both ends, then of clips."""
         columns = ca.horzsplit(rows)
         for k, node in self.cable.held:
             columns[node] = held[:, k]

@@ -1,9 +1,4 @@
-"""The whole cable in motion: segments and ends assembled into one banded system.
-
-Unknowns are ordered along the cable: multipliers of the start's direction, turn and place of
-node 0, force of segment 0 and its springs, node 1, ..., multipliers of the end's direction. Places
-that a fixture holds are known functions of time and no unknowns.
-"""
+"""The whole cable in motion: segments and ends assembled into one banded system."""
 
 from __future__ import annotations
 
@@ -14,13 +9,15 @@ import casadi as ca
 import numpy as np
 from scipy.sparse import csr_array
 
-from dlo_casadi.arrays import FloatArray, IntArray
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.effects import Damping
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.functions import functions_of
+from dlo_casadi.motion.anchors import Anchors
 from dlo_casadi.motion.segment import MovingSegment, moving_segment, refuse_still
 from dlo_casadi.motion.state import Banded, Fixtures, State
+from dlo_casadi.motion.unknowns import Unknowns
 from dlo_casadi.rod.ends import EndConditions
 
 # Newton steps that bow segments to known places, and the share of the softest direction of a force
@@ -57,7 +54,7 @@ class Balance:
         return Banded(self.band(self.stiffness, (of_segment, at_ends)), self.cable.width)
 
 
-class MovingCable:
+class MovingCable(Unknowns):
     """A model with its parameters, on its mesh, ready to be evaluated in motion.
 
     Parameters
@@ -67,6 +64,8 @@ class MovingCable:
     rest : (n_rests,) [1/m]
     still : (n_segments, 2 strains) [1/m], optional
         Strains at rest, see `MovingSegment.still`.
+    anchors : Anchors, optional
+        What clips hold; the model is that of the cable without them.
 
     Raises
     ------
@@ -75,113 +74,20 @@ class MovingCable:
     """
 
     def __init__(
-        self, model: CableModel, p: FloatArray, rest: FloatArray, still: FloatArray | None = None
+        self,
+        model: CableModel,
+        p: FloatArray,
+        rest: FloatArray,
+        still: FloatArray | None = None,
+        anchors: Anchors | None = None,
     ) -> None:
         refuse_still(model)
-        self.model, self.p, self.rest = model, np.asarray(p, float), np.asarray(rest, float)
+        super().__init__(model, p, anchors)
+        self.rest = np.asarray(rest, float)
         self.segment: MovingSegment = moving_segment(model)
-        chain, node = model.chain, model.node
-        self.n_segments, self.n_nodes = chain.n_segments, chain.n_nodes
-        self.b, self.d = node.increment, node.dimension
         if still is None:
-            still = np.zeros((self.n_segments, 2 * len(node.strains)))
+            still = np.zeros((self.n_segments, 2 * len(model.node.strains)))
         self.still = still
-
-    # ---- where unknowns are --------------------------------------------------------------------
-
-    @cached_property
-    def springs_on(self) -> FloatArray:
-        """Which springs are on which segments (n_segments, n_springs): 1 or 0."""
-        places = np.array(functions_of(self.model).spring_places(self.p)).ravel()
-        low, width = self.model.chain.layout.segments[:, :2].T
-        last = np.arange(self.n_segments) == self.n_segments - 1
-        share = (places - low[:, None]) / width[:, None]
-        return ((share >= 0) & ((share < 1) | last[:, None])).astype(float)
-
-    @cached_property
-    def _condition_rows(self) -> tuple[list[int], list[int]]:
-        """Rows of the border of the directions held at the start, and at the end."""
-        names = self.model.condition_names
-        turns = {f"{side}_{turn}" for side in ("start", "end") for turn in self.model.node.turns}
-        rows = [k for k, name in enumerate(names) if name in turns]
-        return (
-            [k for k in rows if names[k].startswith("start")],
-            [k for k in rows if names[k].startswith("end")],
-        )
-
-    @cached_property
-    def places(self) -> tuple[IntArray, IntArray, IntArray, int]:
-        """Unknowns of nodes, forces, moments; their number. -1 for what is no unknown."""
-        b, d, count = self.b, self.d, 0
-        start, end = self._condition_rows
-        nodes = np.full((self.n_nodes, b + d), -1)
-        forces = np.full((self.n_segments, d * (1 + 2 * self.model.n_springs)), -1)
-        moments = np.full(len(start) + len(end), -1)
-
-        def take(rows: IntArray) -> None:
-            nonlocal count
-            rows[...] = np.arange(count, count + rows.size).reshape(rows.shape)
-            count += rows.size
-
-        take(moments[: len(start)])
-        for i in range(self.n_nodes):
-            take(nodes[i, :b])
-            held = i == 0 or (i == self.n_nodes - 1 and self.model.end.place)
-            if not held:
-                take(nodes[i, b:])
-            if i < self.n_segments:
-                take(forces[i, :d])
-                for k in np.flatnonzero(self.springs_on[i]):
-                    take(forces[i, d * (1 + 2 * k) : d * (3 + 2 * k)])
-        take(moments[len(start) :])
-        return nodes, forces, moments, count
-
-    def steps(self, solution: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Increments of turns, places, forces, moments in solutions (N, ...); zero where held."""
-        nodes, forces, moments, _ = self.places
-        known = np.concatenate([solution, np.zeros((1, *solution.shape[1:]))])
-        return known[nodes[:, : self.b]], known[nodes[:, self.b :]], known[forces], known[moments]
-
-    @property
-    def size(self) -> int:
-        """Number of unknowns."""
-        return self.places[3]
-
-    @cached_property
-    def index(self) -> tuple[IntArray, IntArray]:
-        """Unknowns of each segment (n_segments, L), of the ends (2 b + moments,); -1 for none."""
-        nodes, forces, moments, _ = self.places
-        b = self.b
-        first, last = nodes[:-1], nodes[1:]
-        of_segment = np.hstack([first[:, :b], last[:, :b], first[:, b:], last[:, b:], forces])
-        return of_segment, np.concatenate([nodes[0, :b], nodes[-1, :b], moments])
-
-    @cached_property
-    def width(self) -> int:
-        """Half width of the band."""
-        widest = 0
-        of_segment, at_ends = self.index
-        start = len(self._condition_rows[0])
-        b = self.b
-        sides = (
-            np.concatenate([at_ends[:b], at_ends[2 * b : 2 * b + start]]),
-            np.concatenate([at_ends[b : 2 * b], at_ends[2 * b + start :]]),
-        )
-        for row in (*of_segment, *sides):
-            known = row[row >= 0]
-            widest = max(widest, int(np.ptp(known)))
-        return widest
-
-    @cached_property
-    def _scatter(self) -> tuple[IntArray, IntArray]:
-        """Flat places in the band of the matrices of segments and ends; the last one for none."""
-        own = []
-        for index in (self.index[0], self.index[1][None]):
-            rows, columns = index[:, :, None], index[:, None, :]
-            inside = (rows >= 0) & (columns >= 0) & (np.abs(rows - columns) <= self.width)
-            flat = (2 * self.width + rows - columns) * self.size + columns
-            own.append(np.where(inside, flat, (3 * self.width + 1) * self.size).ravel())
-        return own[0], own[1]
 
     # ---- evaluation ----------------------------------------------------------------------------
 
@@ -190,7 +96,9 @@ class MovingCable:
         """Arguments of the segments that do not change in motion."""
         chain, count = self.model.chain, self.n_segments
         rest = chain.rest_inside(self.rest[:, None])[..., 0]
-        place, deviation = chain.layout.segments, np.zeros(len(self.model.deviation_names))
+        if self.anchors is not None:
+            rest = self.anchors.rest_inside(self.model, rest)
+        place, deviation = self.layout, np.zeros(len(self.model.deviation_names))
         rows = [np.tile(self.p, (count, 1)), rest, place, np.tile(deviation, (count, 1))]
         return [*rows, self.springs_on, self.still]
 
@@ -312,11 +220,6 @@ class MovingCable:
         known = np.flatnonzero(index >= 0)
         return csr_array((0 * known + 1.0, (index[known], known)), (self.size, len(index)))
 
-    @property
-    def held(self) -> list[tuple[int, int]]:
-        """Which fixture (0: start, 1: end) holds the place of which node."""
-        return [(0, 0), (1, self.n_nodes - 1)] if self.model.end.place else [(0, 0)]
-
     def band(self, segments: FloatArray, ends: FloatArray) -> FloatArray:
         """Band (3 width + 1, N) summed over the segments (n_segments, L, L) and the ends."""
         height = 3 * self.width + 1
@@ -346,17 +249,6 @@ class MovingCable:
         bent = stiffness / (cable.mass * cable.length**3)
         return float(np.sqrt(bent + np.linalg.norm(self.model.gravity) / cable.length))
 
-    @property
-    def held_turns(self) -> list[int]:
-        """Rows of the border of all directions that the ends hold."""
-        start, end = self._condition_rows
-        return [*start, *end]
-
-    @property
-    def n_moments(self) -> int:
-        """Number of directions that the ends hold."""
-        return len(self.places[2])
-
     # ---- states --------------------------------------------------------------------------------
 
     def fixtures(
@@ -365,10 +257,14 @@ class MovingCable:
         velocities: FloatArray | None = None,
         accelerations: FloatArray | None = None,
     ) -> Fixtures:
-        """The fixtures in a declared pose (n_pose,), at rest by default."""
-        places, none = self.true_places(pose[None])[0], np.zeros((2, self.d))
+        """The fixtures in a declared pose (n_pose,), at rest by default; clips rest."""
+        clips = np.zeros((0, self.d)) if self.anchors is None else self.anchors.places
+        still, none = np.zeros_like(clips), np.zeros((2, self.d))
         moving = (none if x is None else x for x in (velocities, accelerations))
-        return Fixtures(pose, places, *moving)
+        places = np.concatenate([self.true_places(pose[None])[0], clips])
+        return Fixtures(
+            pose[: self.model.n_pose], places, *(np.concatenate([x, still]) for x in moving)
+        )
 
     def true_places(self, poses: FloatArray) -> FloatArray:
         """True places (T, 2, d) [m] of the fixtures in declared poses (T, n_pose)."""
@@ -392,7 +288,11 @@ class MovingCable:
             before = np.cumsum(on[::-1])[::-1].astype(bool) & ~on
             force[before, :d] += lam[rows]
         start, end = self._condition_rows
-        state = self.still_state(eq.x, force, lam[[*start, *end]])
+        x = eq.x
+        if self.anchors is not None:
+            force[:, :d] += self.anchors.pull
+            x = self.anchors.held(x)
+        state = self.still_state(x, force, lam[[*start, *end]])
         return self.with_places(state, fixtures)
 
     def about(self, x: FloatArray) -> MovingCable:
@@ -405,9 +305,11 @@ class MovingCable:
             size = np.linalg.norm(turns, axis=1, keepdims=True)
             turns = turns * np.where(size > 1e-8, 2 * np.arctan(size / 2) / (size + 1e-300), 1.0)
         stretch = float(self.segment.stretch(self.p))
-        mean = turns / (self.model.chain.layout.segments[:, 1:2] * stretch)
-        between = np.gradient(mean, axis=0, edge_order=2 if len(mean) > 2 else 1)
-        return MovingCable(self.model, self.p, self.rest, np.hstack([mean, between]))
+        mean = turns / (self.layout[:, 1:2] * stretch)
+        middle, width = self.layout[:, 0] + self.layout[:, 1] / 2, self.layout[:, 1:2]
+        between = width * np.gradient(mean, middle, axis=0, edge_order=2 if len(mean) > 2 else 1)
+        still = np.hstack([mean, between])
+        return MovingCable(self.model, self.p, self.rest, still, self.anchors)
 
     def still_state(self, x: FloatArray, force: FloatArray, moment: FloatArray) -> State:
         """Nodes at rest, all at the origin."""
@@ -428,8 +330,8 @@ class MovingCable:
             still = self._bowed(still, fixtures, np.diff(near, axis=0), own)
         advance = self.evaluated(still, fixtures).rows[:, own]
         r = np.concatenate([[fixtures.places[0]], advance]).cumsum(axis=0)
-        if self.model.end.place:
-            r[-1] = fixtures.places[1]
+        for k, node in self.held[1:]:
+            r[node] = fixtures.places[k]
         return replace(still, r=r)
 
     def _bowed(self, state: State, fixtures: Fixtures, chords: FloatArray, own: slice) -> State:

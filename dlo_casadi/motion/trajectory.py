@@ -83,7 +83,7 @@ class Way:
         h_t = dt[:, None, None, None]
         now = weights[0] * first + weights[1] * h_t * slope
         now = now + weights[2] * last + weights[3] * h_t * last_slope
-        places = self.cable.model.chain.places
+        places = self.cable.along
         e = np.clip(np.searchsorted(places, s, side="right") - 1, 0, len(places) - 2)
         width = np.diff(places)[e]
         both = np.concatenate([now[:, e], now[:, e + 1]], axis=2)
@@ -117,6 +117,13 @@ class Way:
         load = np.array(functions_of(self.cable.model).dead_load(self.cable.p)).ravel()
         end = -rows[:, -1, d:] if self.cable.model.end.place else np.zeros((len(rows), d))
         return load - rows[:, 0, :d], end
+
+    @cached_property
+    def clip_forces(self) -> FloatArray:
+        """Forces (S, k, d) [N] of the cable on its clips."""
+        rows, d = self._quantities[3], self.cable.d
+        nodes = np.array([node for _, node in self.cable.held[1:] if node < rows.shape[1]], int)
+        return np.asarray(-(rows[:, nodes - 1, d:] + rows[:, nodes, :d]))
 
     @cached_property
     def energy(self) -> FloatArray:

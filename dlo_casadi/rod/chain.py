@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.interpolate import BSpline
@@ -201,3 +202,12 @@ def with_cells_beyond(inside: FloatArray) -> FloatArray:
         still[..., ::3, :] = mean + side * a / 2 + c / 6
         beyond.append(still)
     return np.concatenate([beyond[0], inside, beyond[1]], axis=-3)
+
+
+def moved_rest(inside: Any, x: Any, w: Any) -> tuple[Any, Any, Any]:
+    """Rest strains inside an element of w times an even one's length, with its middle at x in that.
+
+    m + a x + c (x^2 - 1/12) of the even element, |x| <= 1/2, is the same of y at x + w y.
+    """
+    mean, a, c = inside[0], inside[1], inside[2]
+    return mean + a * x + c * (x * x + (w * w - 1) / 12), w * (a + 2 * c * x), c * w * w
