@@ -28,7 +28,8 @@ from scipy.special import jn_zeros
 
 import dlo_casadi as dlo
 from dlo_casadi.cable.fitted_cable import FittedCable
-from dlo_casadi.cable.motion import Motion, moving_cable
+from dlo_casadi.cable.shape_in_motion import moving_cable
+from dlo_casadi.cable.simulated import Motion
 from dlo_casadi.motion.path import FixturePath
 from dlo_casadi.motion.trajectory import TOLERANCE, Way
 

@@ -12,9 +12,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.cable.motion import Motion
 from dlo_casadi.cable.move_checks import held_by, number, table_file
 from dlo_casadi.cable.moving_picture import draw_move
+from dlo_casadi.cable.simulated import Motion
 from dlo_casadi.io.files import write_file
 from dlo_casadi.planning.course import Course
 from dlo_casadi.planning.problem import CLEAR

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.cable.motion import Motion
+from dlo_casadi.cable.simulated import Motion
 from dlo_casadi.errors import DloError
 from dlo_casadi.planning.course import Course
 from dlo_casadi.planning.predicted import curvatures, held_moments

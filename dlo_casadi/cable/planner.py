@@ -11,11 +11,12 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.cable.motion import CableInMotion, Motion
+from dlo_casadi.cable.motion import CableInMotion
 from dlo_casadi.cable.move import RATE, Move, rows_of
 from dlo_casadi.cable.move_checks import held_by
 from dlo_casadi.cable.move_limits import used_along
 from dlo_casadi.cable.shape_in_motion import Modes, directions, moving_cable
+from dlo_casadi.cable.simulated import Motion
 from dlo_casadi.codegen.fit_steps import fastest_steps
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
