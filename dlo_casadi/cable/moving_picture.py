@@ -21,8 +21,13 @@ _SHOWN = 0.12
 _LEAST_MM = 1e-3
 
 
-def draw_motion(points: FloatArray, t: FloatArray, title: str, *, tip: bool) -> Figure:
-    """Draw instants of a motion (T, K, d) [m] from light to dark; `tip`: and its way."""
+def draw_motion(
+    points: FloatArray, t: FloatArray, title: str, clips: FloatArray, *, tip: bool
+) -> Figure:
+    """Draw instants of a motion (T, K, d) [m] from light to dark, and clips (k, d) [m].
+
+    `tip`: and its way.
+    """
     with style.styled((7.0, 6.0)) as drawing:
         axes = _axes(drawing, points)
         picked = np.unique(np.linspace(0, len(t) - 1, _INSTANTS).round().astype(int))
@@ -34,8 +39,10 @@ def draw_motion(points: FloatArray, t: FloatArray, title: str, *, tip: bool) -> 
         axes.plot(
             *points[picked[0], 0][:, None], "s", color=style.BLACK, ms=7, label="start at first"
         )
+        if len(clips):
+            axes.plot(*clips.T, "D", color=style.BLACK, ms=6, label="clips")
         axes.set_title(f"{len(picked)} instants, light to dark: {t[0]:.3g} to {t[-1]:.3g} s")
-        drawing.legend(loc="outside lower center", ncols=2)
+        drawing.legend(loc="outside lower center", ncols=3)
         drawing.suptitle(title, fontsize=12)
     return drawing
 
@@ -78,13 +85,15 @@ def draw_modes(points: FloatArray, modes: FloatArray, names: Sequence[str], titl
     return drawing
 
 
-def moving_picture(points: FloatArray, t: FloatArray, title: str) -> bytes:
-    """A motion (T, K, d) [m], evenly spaced in time, as a GIF in real time."""
+def moving_picture(points: FloatArray, t: FloatArray, title: str, clips: FloatArray) -> bytes:
+    """A motion (T, K, d) [m], evenly spaced in time, and clips (k, d) [m] as a GIF in real time."""
     frames = []
     with style.styled((5.5, 5.0)) as drawing:
         axes = _axes(drawing, points)
         (line,) = axes.plot(*points[0].T, color=style.BLUE, lw=2.5)
         axes.plot(*points[0, 0][:, None], alpha=0)
+        if len(clips):
+            axes.plot(*clips.T, "D", color=style.BLACK, ms=6)
         drawing.suptitle(title, fontsize=11)
         axes.set_title(f"{t[0]:.2f} s")
         style.lay_out(drawing, _DPI)

@@ -84,7 +84,12 @@ class Motion:
     def plot(self) -> Figure:
         """Draw instants of the motion."""
         title, free = f"{self.cable.name}: motion", not self.cable.model.end.place
-        return draw_motion(self.points, self.t, title, tip=free)
+        return draw_motion(self.points, self.t, title, self._clips, tip=free)
+
+    @property
+    def _clips(self) -> FloatArray:
+        """Places (k, d) [m] of clips as declared."""
+        return np.array([clip.place for clip in self.way.path.pose.clips])
 
     def animate(self, path: str | PathLike[str]) -> Path:
         """Write the motion in real time as a GIF; return its path.
@@ -99,7 +104,7 @@ class Motion:
             raise DloError(f"{file}: moving pictures are GIF.\n  Try: {file.with_suffix('.gif')}")
         times = frame_times(float(self.t[0]), float(self.t[-1]))
         points = self.way.points(times, self.s)
-        write_file(file, moving_picture(points, times, f"{self.cable.name}: motion"))
+        write_file(file, moving_picture(points, times, f"{self.cable.name}: motion", self._clips))
         return file
 
     @property
