@@ -122,7 +122,8 @@ class Ipopt:
         model, count, b = self.model, self._count, self.model.node.increment
         at = np.array([np.nan if clip.at is None else clip.at for clip in pose.clips], dtype=float)
         at[np.isnan(at)] = places
-        nodes, along = (part[0] for part in placed_nodes(model.chain, at[None], at[None]))
+        held = np.concatenate([[0.0], at, [model.chain.length]])[None]
+        nodes, along = (part[0] for part in placed_nodes(model.chain, held, held))
         moved = np.ravel(np.arange(count) == nodes[:, None], order="F")
         start, room = np.zeros(b * count + self._rest), np.full((2, b * count + self._rest), np.inf)
         eyelets = nodes[[clip.at is None for clip in pose.clips]]
