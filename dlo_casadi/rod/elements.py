@@ -171,7 +171,8 @@ def _stiffening(x: ca.SX) -> tuple[ca.SX, ca.SX]:
 
     Lower bound                                      0.25   0.6  0.7  0.8  0.85
     600 descents of a limp cable on a strong tether   600   599  590  568   490  converge
-    108 ropes between pins, 6 to 20 elements           89   101  103  105   104  have their tension
+    108 ropes between pins, 6 to 20 elements           89   100  103  105   104  have their tension
+    (`scripts/check_ropes.py`)
 
     A bound of 0.7 leaves a cable in space of 20 elements that is carried and stops without a step
     in time: where the function bends, massless insides of elements are not definite.
