@@ -109,7 +109,15 @@ class Motion:
 
     @property
     def unknowns(self) -> list[dict[str, FloatArray]]:
-        """Arguments x, v, a and multipliers of `motion_equations` at the ends of all steps."""
+        """Arguments x, v, a and multipliers of `motion_equations` at the ends of all steps.
+
+        Raises DloError if clips hold the cable, or did before: these equations know none.
+        """
+        if self.way.cable.anchors is not None:
+            raise DloError(
+                "unknowns: `motion_equations` knows no clips, and these nodes stand at clips.\n"
+                "  Try: a motion without clips, or cable.step(dt, about=shape)."
+            )
         both = zip(self.way.states, *self.way.forces, strict=True)
         return [unknowns_of(self.way.cable, state, (first, last)) for state, first, last in both]
 
@@ -131,7 +139,16 @@ def begun(
     x, places = begins.equilibrium.x, moving.along
     if x.shape[1] != moving.model.node.coordinates:
         raise DloError("begins: a shape in space cannot move in a plane, nor the reverse")
+    if not begins.cable.model.chain.kind.smooth:
+        raise DloError(
+            "begins: a shape of links belongs to no motion.\n  Try: 'quadratic' elements"
+        )
     known, points = nodes_of(begins)
+    if not np.allclose(known[[0, -1]], [0.0, cable.length]):
+        raise DloError(
+            f"begins: the shape is of a cable from {known[0]:.4g} to {known[-1]:.4g} m, this one "
+            f"is {cable.length:.4g} m long.\n  Try: the same length, without an end that slides."
+        )
     nodes = moving.model.node.interpolated(places, known, x)
     if moving.anchors is not None:
         nodes = moving.anchors.held(nodes)

@@ -114,6 +114,20 @@ def test_what_clips_cannot_do_is_told():
         cable.simulate(T[:2], **held(2), clips=[{**one, "at": 0.5}], begins=motion)
     with pytest.raises(dlo.DloError, match="from clip_1"):
         cable.simulate(T[:2], **held(2), clips=[one], begins=cable.solve(**held(2)))
+    with pytest.raises(dlo.DloError, match="knows no clips"):
+        _ = motion.unknowns
+    other = dlo.known_cable(
+        dlo.Cable(length=1.2, mass=MASS, diameter=0.006, bending_stiffness=STIFFNESS),
+        gravity=(0.0, -9.81), boundary=("clamped", "pinned"), model={"n": 20},
+    )  # fmt: skip
+    with pytest.raises(dlo.DloError, match=r"from 0 to 1\.2 m"):
+        cable.simulate(T[:2], **held(2), begins=other.solve(**held(2)))
+    links = dlo.known_cable(
+        dlo.Cable(length=LENGTH, mass=MASS, diameter=0.006, bending_stiffness=STIFFNESS),
+        gravity=(0.0, -9.81), boundary=("clamped", "pinned"), model={"n": 20, "element": "link"},
+    )  # fmt: skip
+    with pytest.raises(dlo.DloError, match="a shape of links"):
+        cable.simulate(T[:2], **held(2), begins=links.solve(**held(2)))
     with pytest.raises(dlo.DloError, match="clips: recorded motions"):
         cable.with_clips(["pinned"]).motion_equations()
 
