@@ -47,7 +47,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "sensing": {*MECHANICS, "vision"},
     "estimation": {*MECHANICS, "motion", "codegen", "sensing", "runtime"},
     "paper": {*MECHANICS, "sensing"},
-    "diagnosis": {*MECHANICS, "sensing", "estimation", "runtime"},
+    "diagnosis": {*MECHANICS, "motion", "sensing", "estimation", "runtime"},
     "tracking": {
         *MECHANICS,
         "motion",

@@ -13,13 +13,14 @@ Leamer, Specification Searches (1978): bounds of an estimate over models that da
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from dlo_casadi.diagnosis.gram import Gram
 from dlo_casadi.diagnosis.next_measurement import Telling, telling
+from dlo_casadi.diagnosis.next_motion import NextMotion, next_motion
 from dlo_casadi.diagnosis.widened import Widened
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.constrained import threshold
@@ -31,6 +32,9 @@ from dlo_casadi.thresholds import ALIKE, NORMAL_95
 # Largest factor by which the refit moves an end, of its logarithm; it was 1.5 in markers_in_space.
 # Measured in 13 plane sessions: intervals 4.5 times as wide as `interval_95` (median), 3.0 without.
 FARTHEST = 2.0
+# Ratio of widths from which on it is said what a hidden effect would do to a stiffness.
+WIDER = 1.2
+Ends = tuple[float | None, float | None]
 
 
 class Size(NamedTuple):
@@ -57,13 +61,32 @@ class IfHidden:
         from the estimate: so large an effect is not excluded.
     telling : Telling or None
         The measurement that would exclude it; None if no equilibria are found there.
+    rivals : (Fit, Fit) or None
+        The fit, and that with the effect at the end of the interval.
+    motion : NextMotion or None
+        The motion that would exclude it, once it is asked for, see `with_motion`.
     """
 
     parameter: str
     effect: str
-    interval: tuple[float | None, float | None]
+    interval: Ends
     values: Mapping[str, Size]
     telling: Telling | None
+    rivals: tuple[Fit, Fit] | None = field(default=None, repr=False)
+    motion: NextMotion | None = None
+
+    def with_motion(self) -> IfHidden:
+        """The same with the motion that would exclude it."""
+        if self.rivals is None:
+            return self
+        fit, other = self.rivals
+        return replace(self, motion=next_motion(fit, {self.effect: other}))
+
+
+def wider(one: Ends, other: Ends) -> bool:
+    """Whether an interval of a positive number is wider than another one by more than WIDER."""
+    widths = [np.log(high / low) if low and high else np.inf for low, high in (one, other)]
+    return bool(widths[0] > WIDER * widths[1])
 
 
 def if_hidden(fit: Fit, gram: Gram) -> dict[str, IfHidden]:
@@ -93,9 +116,9 @@ def _widest(fit: Fit, name: str, rows: Sequence[Widened]) -> IfHidden:
         far *= float(np.clip(more, 1.0, FARTHEST))
         low, high = min(low, far), max(high, far)
     low, high = (float(value * np.exp(end)) for end in (low, high))
-    told = None if other is None else telling(fit, other)
     sizes = _sizes(fit, row, _linear(fit, row, name, far))
-    return IfHidden(name, row.candidate.name, (low, high), sizes, told)
+    told = (None, None) if other is None else (telling(fit, other), (fit, other))
+    return IfHidden(name, row.candidate.name, (low, high), sizes, *told)
 
 
 def _linear(fit: Fit, row: Widened, name: str, far: float) -> dict[str, float]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.diagnosis.selection import AddedEffect
+from dlo_casadi.diagnosis.selection import AddedEffect, rivals_of
 from dlo_casadi.equilibrium.curve import Observed
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.spread import Repeats
@@ -139,19 +139,11 @@ class NextPose:
 
 
 def separating_pose(fit: Fit, added: Sequence[AddedEffect]) -> NextPose | None:
-    """Pose that separates one of a fit's added effects from its closest rival.
-
-    A rival fitted before another effect was found does not count: the poses would differ by that
-    effect, too.
-    """
-    own = {effect.label for effect in fit.model.effects}
+    """Pose that separates one of a fit's added effects from its closest rival."""
     for item in added:
-        for rival in item.rivals:
-            apart = own ^ {effect.label for effect in rival.fit.model.effects}
-            if apart <= {item.candidate.effect.label, rival.candidate.effect.label}:
-                found = next_pose(fit, rival.fit)
-                names = (item.candidate.name, rival.candidate.name)
-                return None if found is None else replace(found, separates=names)
+        for name, rival in rivals_of(fit, item).items():
+            found = next_pose(fit, rival.fit)
+            return None if found is None else replace(found, separates=(item.candidate.name, name))
     return None
 
 

@@ -151,6 +151,21 @@ class Found:
         return log(comb(candidates, min(len(self.added), candidates)))
 
 
+def rivals_of(fit: Fit, item: AddedEffect) -> dict[str, Confirmed]:
+    """Rivals of one of a fit's added effects by name, the closest first.
+
+    A rival fitted before another effect was found does not count: shapes would differ by that
+    effect, too.
+    """
+    own, label = {effect.label for effect in fit.model.effects}, item.candidate.effect.label
+    return {
+        rival.candidate.name: rival
+        for rival in item.rivals
+        if own ^ {effect.label for effect in rival.fit.model.effects}
+        <= {label, rival.candidate.effect.label}
+    }
+
+
 def likelier_by(fit: Fit, other: Fit) -> float:
     """Log evidence of the other fit minus that of the first, on the finer of both meshes."""
     n = max(fit.model.n, other.model.n)

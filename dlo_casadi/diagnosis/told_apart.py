@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 from dlo_casadi.diagnosis.candidates import Candidate, candidates, setup_of
 from dlo_casadi.diagnosis.refits import load_instead
-from dlo_casadi.diagnosis.selection import AddedEffect, likelier_by
+from dlo_casadi.diagnosis.selection import AddedEffect, likelier_by, rivals_of
 from dlo_casadi.effects import Load, PointLoad
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import descend
@@ -59,13 +59,9 @@ def among_rivals(
     A rival with which no recording can be followed is left out. `fit`: of the still poses, with
     what was found. `damping_time` [s]: a first guess.
     """
-    label = item.candidate.effect.label
-    own = {effect.label for effect in fit.model.effects}
     fits = [(item.candidate, fit)]
-    for rival in item.rivals:
-        apart = own ^ {effect.label for effect in rival.fit.model.effects}
-        if apart <= {label, rival.candidate.effect.label}:
-            fits.append((rival.candidate, descend(rival.fit.weighed_as(fit))))
+    for rival in rivals_of(fit, item).values():
+        fits.append((rival.candidate, descend(rival.fit.weighed_as(fit))))
     if len(fits) == 1:
         return []
     moved: list[_Moved] = []

@@ -90,7 +90,7 @@ class ModesAtRest:
         """Standard deviations (2, count) of `numbers` under a fit's covariance, to first order."""
         total = np.zeros((2, self.count))
         for p, rest in directions(self.model, known):
-            total += (self._moved(p / 2, rest / 2) - self._moved(-p / 2, -rest / 2)) ** 2
+            total += (self.moved(p / 2, rest / 2) - self.moved(-p / 2, -rest / 2)) ** 2
         return np.sqrt(total)
 
     def displacements(self, s: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -101,7 +101,7 @@ class ModesAtRest:
         moving, state, found = self.state()
         return displacements(moving, state, found.vectors, s)
 
-    def _moved(self, p: FloatArray, rest: FloatArray) -> FloatArray:
+    def moved(self, p: FloatArray, rest: FloatArray) -> FloatArray:
         """`numbers` of the cable with changed parameters and rest strains, in the same pose."""
         p, rest = self.p + p, self.rest + rest
         own = solve_equilibrium(self.model, p, rest, self.pose, x_init=self.equilibrium.x)

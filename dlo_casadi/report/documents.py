@@ -20,6 +20,7 @@ from dlo_casadi.cable.saved import cable_document, parameters_hash
 from dlo_casadi.config import Config, Limits, dump_yaml
 from dlo_casadi.config.values import AXES
 from dlo_casadi.diagnosis.if_hidden import IfHidden
+from dlo_casadi.diagnosis.next_motion import NextMotion
 from dlo_casadi.equilibrium.spread import Uncertainty
 from dlo_casadi.estimation.prediction import uncertainty_of
 from dlo_casadi.estimation.result import Fit
@@ -54,6 +55,27 @@ def hidden_dict(found: IfHidden) -> dict[str, Any]:
     return fields_of(found, "effect", "interval") | {
         "parameters": {name: size._asdict() for name, size in found.values.items()},
         "telling": found.telling and asdict(found.telling),
+        "motion": motion_proposal(found.motion),
+    }
+
+
+def motion_proposal(found: NextMotion | None) -> dict[str, Any] | None:
+    """The motion that would tell models of the same still shapes apart."""
+    if found is None:
+        return None
+    return {
+        **fields_of(found, "pose", "of"),
+        "at_m": found.at,
+        "aside_m": found.aside,
+        "duration_s": found.duration,
+        "frequencies_hz": found.frequencies,
+        "rivals": {
+            name: {
+                "frequencies_hz": one.frequencies,
+                "expected_difference_std": one.separation,
+            }
+            for name, one in found.rivals.items()
+        },
     }
 
 

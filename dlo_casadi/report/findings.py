@@ -6,7 +6,9 @@ from typing import NamedTuple
 import numpy as np
 
 from dlo_casadi.cable.estimate import from_to
+from dlo_casadi.diagnosis.if_hidden import wider
 from dlo_casadi.diagnosis.next_measurement import MOST_REPEATS, NextPose, NextReading
+from dlo_casadi.diagnosis.next_motion import NextMotion, Swing
 from dlo_casadi.diagnosis.structure import LARGEST_SCORE
 from dlo_casadi.errors import worded
 from dlo_casadi.report.words import NOISE_ALONE, seen, sentence
@@ -16,9 +18,6 @@ from dlo_casadi.session.sentences import Sentence, Values, said_of
 from dlo_casadi.show.text import millimetres, vector
 from dlo_casadi.thresholds import NOTABLE, UNSEEN
 
-Ends = tuple[float | None, float | None]
-# Ratio of widths from which on it is said what a hidden effect would do to a stiffness.
-WIDER = 1.2
 # What the residual may depend on, by the name of its normal score.
 DEPENDENCES = {
     "order_z": "the order of the poses",
@@ -151,18 +150,12 @@ def _added(outcome: Outcome) -> Iterator[Values]:
                 yield {"line": f"It is told from {name}: log evidence {said}."}
 
 
-def _wider(one: Ends, other: Ends) -> bool:
-    """Whether an interval of a positive number is wider than another one by more than WIDER."""
-    widths = [np.log(high / low) if low and high else np.inf for low, high in (one, other)]
-    return bool(widths[0] > WIDER * widths[1])
-
-
 def _hidden(outcome: Outcome) -> Iterator[Values]:
     """What one effect that the data do not exclude could do to each stiffness."""
     last = outcome.stages[-1].parameters
     for name, found in outcome.if_hidden.items():
         interval, known = last[name].interval_95_if_hidden, last[name].interval_95
-        if interval is None or known is None or not _wider(interval, known):
+        if interval is None or known is None or not wider(interval, known):
             continue
         tip, telling = found.telling, ""
         if tip is not None:
@@ -172,6 +165,8 @@ def _hidden(outcome: Outcome) -> Iterator[Values]:
             far = tip.difference > UNSEEN * expected
             other = "So would another pose" if far else "No other pose would tell"
             telling += worded(_TURNED, other=other, tip=tip, expected=expected)
+        if found.motion is not None and (swings := told_by(found.motion)):
+            telling += f" So would a motion: {let_go_text(found.motion)}; {swings}."
         sizes = (f"{key} {x.value:.2g} {x.unit}".strip() for key, x in found.values.items())
         yield {
             "found": found,
@@ -200,6 +195,11 @@ def _proposed(outcome: Outcome) -> Iterator[Values]:
             "separation": separation_text(proposal),
             "reading": reading_text(proposal.reading),
         }
+
+
+def _let_go(outcome: Outcome) -> Iterator[Values]:
+    if (motion := outcome.next_motion) is not None and (swings := told_by(motion)):
+        yield {"of": motion.of, "go": let_go_text(motion), "swings": swings}
 
 
 _TIPPING = (
@@ -237,6 +237,7 @@ FINDINGS: tuple[Sentence[Outcome], ...] = (
     ),
     Sentence("To tell {rivals}: hold the end at {end}; {separation}", _proposed),
     Sentence("{reading}", _proposed),
+    Sentence("To tell {of} by a motion: {go}; {swings}.", _let_go),
 )
 
 
@@ -253,6 +254,31 @@ def separation_text(proposal: NextPose) -> str:
         if proposal.times == 1
         else f"measure it {proposal.times} times."
     )
+
+
+def let_go_text(motion: NextMotion) -> str:
+    """How a proposed motion is made."""
+    return (
+        f"hold the ends as in {motion.pose}, pull the cable aside by {motion.aside:.2g} m at "
+        f"{motion.at:.3g} m from the start, and let it swing"
+    )
+
+
+def told_by(motion: NextMotion) -> str:
+    """What a proposed motion tells apart: rivals by NOTABLE standard deviations or more."""
+
+    def hertz(one: NextMotion | Swing) -> str:
+        return ", ".join(f"{x:.3g}" for x in one.frequencies)
+
+    told = [
+        f"{name} by {one.separation:.2g} standard deviations ({hertz(one)} Hz)"
+        for name, one in motion.rivals.items()
+        if one.separation >= NOTABLE
+    ]
+    if not told:
+        return ""
+    own = f"it swings at {hertz(motion)} Hz and differs in {motion.duration:g} s from "
+    return own + " and from ".join(told)
 
 
 def reading_text(reading: NextReading, where: str = "there") -> str:

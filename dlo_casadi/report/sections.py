@@ -341,7 +341,10 @@ SECTIONS = (
         lambda outcome: "Next pose",
         applies=lambda outcome: outcome.next_pose,
         context=lambda outcome: {"next_pose": outcome.next_pose},
-        data=lambda outcome: {"next_pose": _next_pose(outcome)},
+        data=lambda outcome: {
+            "next_pose": _next_pose(outcome),
+            "next_motion": documents.motion_proposal(outcome.next_motion),
+        },
     ),
     Section(
         "limits",

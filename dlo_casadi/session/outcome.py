@@ -17,6 +17,7 @@ from dlo_casadi.config import Config, Pose
 from dlo_casadi.diagnosis.diagnose import Verdict
 from dlo_casadi.diagnosis.if_hidden import IfHidden
 from dlo_casadi.diagnosis.next_measurement import NextPose
+from dlo_casadi.diagnosis.next_motion import NextMotion
 from dlo_casadi.diagnosis.selection import Ranked
 from dlo_casadi.diagnosis.structure import Structure
 from dlo_casadi.diagnosis.unknown_force import UnknownForce
@@ -320,6 +321,8 @@ class Outcome:
         Fitted load that assumes no cause.
     next_pose : NextPose or None
         The pose that best separates rival explanations.
+    next_motion : NextMotion or None
+        The motion that does, if the session has none.
     structure : (Structure, Structure) or None
         Tests of the residual before and after.
     cross_validated : float or None [m]
@@ -357,6 +360,7 @@ class Outcome:
     candidates: tuple[Ranked, ...] = ()
     unexplained: UnknownForce | None = None
     next_pose: NextPose | None = None
+    next_motion: NextMotion | None = None
     structure: tuple[Structure, Structure] | None = None
     cross_validated: float | None = None
     if_hidden: Mapping[str, IfHidden] = field(default_factory=dict)

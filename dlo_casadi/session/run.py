@@ -12,8 +12,9 @@ from dlo_casadi.config import Config, declared_effects, declared_setup
 from dlo_casadi.diagnosis.diagnose import diagnose
 from dlo_casadi.diagnosis.from_data import from_data
 from dlo_casadi.diagnosis.from_pose_to_pose import at_random, with_loose_poses
-from dlo_casadi.diagnosis.if_hidden import IfHidden
+from dlo_casadi.diagnosis.if_hidden import IfHidden, wider
 from dlo_casadi.diagnosis.next_measurement import separating_pose
+from dlo_casadi.diagnosis.next_motion import separating_motion
 from dlo_casadi.diagnosis.selection import AddedEffect
 from dlo_casadi.diagnosis.told_apart import among_rivals
 from dlo_casadi.errors import DloError, EstimationError
@@ -225,6 +226,7 @@ class _Run:
             begin(self.executor, fitting.minimum_by_ipopt, fit) if diagnosis.added else None
         )
         next_pose = separating_pose(diagnosis.fit, diagnosis.added)
+        moved = None if self.motions else separating_motion(diagnosis.fit, diagnosis.added)
         if diagnosis.unexplained or (nearest.noise.source == "misfit" and diagnosis.added):
             stages[-1] = _marked(stages[-1], explains=False)
         elif diagnosis.added:
@@ -260,6 +262,7 @@ class _Run:
             "candidates": ranked,
             "unexplained": diagnosis.unknown_force,
             "next_pose": next_pose,
+            "next_motion": moved,
             "structure": (diagnosis.structure_before, diagnosis.structure),
             "cross_validated": validated.rmse if told else None,
             "if_hidden": diagnosis.if_hidden,
@@ -350,6 +353,12 @@ def judged(outcome: Outcome) -> Outcome:
         stages = (*stages[:-1], _marked(stages[-1], verdict != "unexplained"))
     hidden = {} if verdict == "unexplained" else _joined(stages[-1], outcome.if_hidden)
     stages = (*stages[:-1], _if_hidden(stages[-1], hidden))
+    if not outcome.config.experiment.motions:
+        known = stages[-1].parameters
+        for name, one in hidden.items():
+            before = known[name].interval_95
+            if before is not None and wider(one.interval, before):
+                hidden[name] = one.with_motion()
     return replace(
         outcome,
         verdict=verdict,

@@ -34,6 +34,7 @@ KEYS = {
     "either_side": dict,
     "unexplained": type(None),
     "next_pose": type(None),
+    "next_motion": type(None),
     "structure": type(None),
     "if_hidden": dict,
     "limits": list,

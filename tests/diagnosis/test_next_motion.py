@@ -1,0 +1,88 @@
+"""The let-go that separates models of the same still shapes."""
+
+import numpy as np
+import pytest
+
+from dlo_casadi.diagnosis.next_motion import (
+    ASIDE,
+    DURATION,
+    RATE,
+    _variances,
+    next_motion,
+)
+from dlo_casadi.effects import CableData, Effect, ImageScale, LumpedMass, PointForce
+from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.estimation.fit import fit_model
+from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.estimation.result import Fit
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.tolerances import Tolerances
+from dlo_casadi.sensing.measured_pose import MeasuredPose
+
+LENGTH, MASS, PLACE, STD = 0.6, 0.012, 0.45, 4e-4
+CABLE = CableData(LENGTH, 0.08, 0.008, 0.012, straight=True)
+MODEL = CableModel(CABLE, 12, start="clamped", end="free", n_rest=0)
+
+
+@pytest.fixture(scope="module")
+def measured() -> list[MeasuredPose]:
+    """Markers of a cable with a weight."""
+    heavy, rng = MODEL.with_effect(LumpedMass()), np.random.default_rng(0)
+    p = values_of(heavy, "lumped_mass.position", **{"lumped_mass.mass": MASS})
+    poses = [HeldPose((0.0, 0.0), None, h, name=f"{h:g}") for h in (-2.4, -1.4, -0.8, 0.2)]
+    s, rest = np.linspace(0.1, 1.0, 8) * LENGTH, np.zeros(MODEL.chain.n_rests)
+    shapes = predict_poses(heavy, p, rest, poses)
+    return [
+        MeasuredPose.of_points(x, y.curve.at(s) + STD * rng.normal(size=(8, 2)), s=s)
+        for x, y in zip(poses, shapes, strict=True)
+    ]
+
+
+def fitted(measured: list[MeasuredPose], effect: Effect) -> Fit:
+    """The fit with a load at the right place."""
+    model, place = MODEL.with_effect(effect), f"{effect.label}.position"
+    free = [name for name in model.names if name != place]
+    return fit_model(model, measured, Tolerances(), STD, free=free, values=values_of(model, place))
+
+
+def values_of(model: CableModel, place: str, **known: float) -> np.ndarray:
+    known |= {place: PLACE}
+    return np.array([known.get(x, y) for x, y in zip(model.names, model.nominal, strict=True)])
+
+
+def test_a_rate_is_known_as_well_as_linear_least_squares_knows_it() -> None:
+    """A damped wave of unknown amplitude, phase, rate and damping in white noise."""
+    w, zeta, size = 2 * np.pi * 6.0, 0.01, 0.05  # of many periods
+    t = np.arange(0.0, DURATION, 1 / RATE)
+    decay = np.exp(-zeta * w * t)
+    x, y = decay * np.cos(w * t), decay * np.sin(w * t)
+    by = np.stack([x, y, -size * t * x, -size * t * y], axis=1)
+    variance = np.linalg.inv(by.T @ by)[3, 3]
+    found = list(_variances(np.array([w]), np.array([zeta]), np.array([size**2]), 1))
+    assert found == pytest.approx([variance], rel=0.02)
+
+
+def test_a_weight_swings_slower_than_a_force(measured: list[MeasuredPose]) -> None:
+    weight, force = (fitted(measured, effect) for effect in (LumpedMass(), PointForce()))
+    told = next_motion(weight, {"point_force": force}, "lumped_mass")
+    assert told is not None
+    rival = told.rivals["point_force"]
+    assert told.of == "lumped_mass"
+    assert told.pose in {item.pose.name for item in measured}
+    assert told.at == pytest.approx(LENGTH)
+    assert told.aside == pytest.approx(ASIDE * LENGTH)
+    assert rival.frequencies[0] > 1.05 * told.frequencies[0]
+    assert rival.separation > 6.3, "a log evidence of 20"
+
+
+def test_what_swings_alike_is_not_apart(measured: list[MeasuredPose]) -> None:
+    weight = fitted(measured, LumpedMass())
+    told = next_motion(weight, {"itself": weight})
+    assert told is not None
+    assert told.rivals["itself"].separation == pytest.approx(0.0, abs=1e-6)
+
+
+def test_recordings_know_no_effect_of_the_camera(measured: list[MeasuredPose]) -> None:
+    plain = fit_model(MODEL, measured, Tolerances(), STD)
+    scaled = fit_model(MODEL.with_effect(ImageScale()), measured, Tolerances(), STD)
+    assert next_motion(plain, {"image_scale": scaled}) is None
