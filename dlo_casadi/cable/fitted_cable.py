@@ -231,8 +231,7 @@ class Shape(ShapeInMotion):
         return self._along(self._measured)
 
     def _along(self, held: SolvedCable) -> CableCurve:
-        curve = held.curve.along(self.free_length)
-        return CableCurve(curve.length, curve.nodes, curve.slopes, curve.knots)
+        return CableCurve.of(self.free_length, held.curve.along(self.free_length).numbers)
 
     @property
     def free_length(self) -> float:

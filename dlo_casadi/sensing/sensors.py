@@ -139,7 +139,8 @@ class _Points(Sensor):
     ) -> tuple[FloatArray, FloatArray]:
         """Residual (R,) [m] and its change (R, q) along directions."""
         gap = self.points - seen.curve.at(places)
-        moved = -seen.curve.moved(places, along.curve, along.knots, marked=self.marked)
+        ends = along.ends if self.marked else None
+        moved = -seen.curve.moved(places, along.curve, ends)
         both = self.components(seen.curve, places, np.dstack([gap, moved]))
         return both[:, 0], both[:, 1:]
 
