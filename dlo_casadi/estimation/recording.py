@@ -73,7 +73,8 @@ class Recording:
         Longest step of time. Derivatives are those of these steps; points are extrapolated from
         them and from half of them, to fourth order.
     basis : Basis, optional
-        Of the first state; None if the cable hangs still at first.
+        What the first state is made of, its coordinates are among the recording's own unknowns;
+        None if the cable hangs still at first, and nothing of its first state is unknown.
     until : float [s]
         Only points up to this time are compared.
     period : float [s]
@@ -111,7 +112,7 @@ class Recording:
         """Standard deviations (n_own,) of its own unknowns.
 
         These are deviations of the end's place [m], of the directions of the start and of the end
-        [rad], then the coordinates of the first state, see `beginning`.
+        [rad], then the coordinates eta and zeta of the first state, see `beginning`.
         """
         parts = [np.full(len(self._turned(model)), getattr(self.tolerances, model.node.tolerance))]
         if model.end.place:

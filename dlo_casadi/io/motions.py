@@ -25,6 +25,10 @@ _SLOWEST = 0.5
 _LEAST = 10
 """Fewest instants of a recording."""
 
+_FIRST, _ALONE = 3, 0.75
+"""Errors of cubics in which the release of a cable shows; the share of one that markers beside it
+do not have, if it is that of one marker: 1, or more if two exchange their labels."""
+
 _DEGREES = 30.0
 """Largest heading [rad]: nearly five turns; 30 degrees are no rare angle."""
 
@@ -228,14 +232,41 @@ def _check_times(t: FloatArray, where: _Where) -> None:
         )
 
 
-def first_jump(motion: MotionPoints, length: float) -> tuple[int, int, float] | None:
+def first_jump(
+    motion: MotionPoints, length: float, *, together: bool = False
+) -> tuple[int, int, float] | None:
     """Instant, marker and distance [m] of the first point that jumps; None if none does.
 
     A point is compared with the cubic polynomial through two points before and two after it, whose
     error in a smooth motion is x'''' dt^4 / 6 and alike at neighbouring instants; a jump is six
-    times what these show at the median, and a hundredth of the cable's length.
+    times what these show at the median, and a hundredth of the cable's length. A cable let go is
+    not smooth in its first instants, but along itself: there a jump is not that of the markers
+    beside it, either, unless all points of an instant may jump `together`.
     """
     found: list[tuple[int, int, float]] = []
+    errors = _errors_of_cubics(motion)
+    for j, error in enumerate(np.moveaxis(errors, 1, 0)):
+        k = np.flatnonzero(np.isfinite(error[:, 0]))
+        if not len(k):
+            continue
+        off, count = np.linalg.norm(error[k], axis=1), len(k)
+        padded = np.pad(off, 9, mode="reflect" if count > 9 else "edge")
+        # Beside a jump at one instant the two before and after it are off as well.
+        beside = [padded[9 + lag : 9 + lag + count] for lag in range(-9, 10) if abs(lag) > 2]
+        large = (off > 6 * np.median(beside, axis=0)) & (off > 0.01 * length)
+        if not together:
+            along = error[k[:_FIRST]] - _beside(errors[k[:_FIRST]], j)
+            large[:_FIRST] &= np.linalg.norm(along, axis=1) > _ALONE * off[:_FIRST]
+        if large.any():
+            first = int(large.argmax())
+            best = first + int(off[first : first + 3].argmax())
+            found.append((int(k[best]), j, float(off[best])))
+    return min(found, default=None)
+
+
+def _errors_of_cubics(motion: MotionPoints) -> FloatArray:
+    """Points (T, K, d) less cubics through the two before and the two after them; else NaN."""
+    errors = np.full_like(motion.points, np.nan)
     for j in range(motion.points.shape[1]):
         k = np.flatnonzero(np.isfinite(motion.points[:, j, 0]))
         if len(k) < _LEAST:
@@ -249,15 +280,16 @@ def first_jump(motion: MotionPoints, length: float) -> tuple[int, int, float] | 
             for other in (*others[:i], *others[i + 1 :]):
                 weight *= (t[2:-2] - other) / (others[i] - other)
             through += weight[:, None] * x[lag : lag + count]
-        off = np.linalg.norm(x[2:-2] - through, axis=1)
-        padded = np.pad(off, 9, mode="reflect" if count > 9 else "edge")
-        # Beside a jump at one instant the two before and after it are off as well.
-        beside = [padded[9 + lag : 9 + lag + count] for lag in range(-9, 10) if abs(lag) > 2]
-        jumps = np.flatnonzero((off > 6 * np.median(beside, axis=0)) & (off > 0.01 * length))
-        if len(jumps):
-            best = jumps[0] + int(off[jumps[0] : jumps[0] + 3].argmax())
-            found.append((int(k[best + 2]), j, float(off[best])))
-    return min(found, default=None)
+        errors[k[2:-2], j] = x[2:-2] - through
+    return errors
+
+
+def _beside(errors: FloatArray, j: int) -> FloatArray:
+    """Mean (T, d) of the errors (T, K, d) of the markers next to marker j; 0 where none is seen."""
+    sides = np.delete(errors[:, max(j - 1, 0) : j + 2], min(j, 1), axis=1)
+    seen = np.isfinite(sides[..., :1])
+    total = np.where(seen, sides, 0.0).sum(axis=1)
+    return np.asarray(total / np.maximum(seen.sum(axis=1), 1))
 
 
 # ---- fixtures ----------------------------------------------------------------------------------

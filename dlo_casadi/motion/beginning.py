@@ -38,15 +38,17 @@ _DIFFERENCE = 1e-5
 
 @dataclass(frozen=True, eq=False)
 class Basis:
-    """Forces F_k that make first states.
+    """What a first state is made of: a shape near the measured one, and forces that change it.
 
     Parameters
     ----------
     forces : (N, m)
-        Of modes scaled such that the largest displacement is the cable's length.
+        F_k of the m lowest modes at rest, scaled such that eta_k = 1 near rest moves the cable by
+        its length, where the mode is largest.
     frequencies : (m,) [rad/s]
+        w_k.
     about : State
-        q_1.
+        q_1, along the first points; the shape at rest until `near` is called.
     springs : float [1/s^2]
         h.
     """
@@ -87,7 +89,9 @@ class Basis:
 def begun(
     cable: MovingCable, near: State, fixtures: Fixtures, basis: Basis, first: FloatArray
 ) -> State:
-    """The state of coordinates (2 m,): eta, then zeta [1/s].
+    """The first state of its coordinates (2 m,): eta gives the shape, zeta [1/s] the velocity.
+
+    `near`: a state from which Newton's method for the shape begins.
 
     Raises
     ------

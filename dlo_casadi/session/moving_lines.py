@@ -121,7 +121,7 @@ def _across(tangents: FloatArray) -> FloatArray:
 
 def check_lines(marks: MotionPoints, length: float) -> None:
     """Refuse a line that is far from those just before and after it."""
-    if jump := first_jump(marks, length):
+    if jump := first_jump(marks, length, together=True):
         k, _, off = jump
         raise MeasurementError(
             f"the line at {marks.t[k]:g} s is {1e3 * off:.3g} mm away from those just before and "
@@ -226,7 +226,7 @@ def _line(
 def without_jumps(marks: MotionPoints, length: float, note: str) -> tuple[MotionPoints, str]:
     """Marks without frames whose line is far from those just before and after it."""
     points, count = marks.points.copy(), 0
-    while jump := first_jump(replace(marks, points=points), length):
+    while jump := first_jump(replace(marks, points=points), length, together=True):
         points[jump[0]] = np.nan
         count += 1
     if count:

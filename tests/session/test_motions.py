@@ -129,6 +129,21 @@ def swapped(rows: np.ndarray) -> np.ndarray:
     return rows
 
 
+def let_go(rows: np.ndarray, markers: np.ndarray) -> np.ndarray:
+    """Some markers swing back from aside within a few instants, each by as much as it is away."""
+    rows, t = rows.copy(), rows[:, 0] - rows[0, 0]
+    wave = 0.1 * np.exp(-t / 0.012) * np.cos(60 * t)
+    rows[:, 2] -= np.where(np.isin(rows[:, 1], markers), wave * rows[:, 1] / markers[-1], 0.0)
+    return rows
+
+
+def test_a_cable_let_go_moves_quickly_as_a_whole_at_first(tmp_path: Path) -> None:
+    later = swing()[8:]
+    read(tmp_path, points=let_go(later, S))
+    with pytest.raises(dlo.MeasurementError, match=r"the marker at 0.3 m is .* wrong label"):
+        read(tmp_path, points=let_go(later, S[1:2]))
+
+
 BROKEN = {
     "backwards": (RESTING, swing()[::-1], None, r"swing.csv: line 5: t_s 1.16 follows 1.18"),
     "gap": (
