@@ -24,6 +24,7 @@ from dlo_casadi.effects import (
 )
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.by_ipopt import by_ipopt
+from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.equilibrium import curvatures_along
 from dlo_casadi.equilibrium.eyelets import slid
 from dlo_casadi.equilibrium.guess_table import guess_table
@@ -415,22 +416,30 @@ def test_a_clearance_beside_a_saddle_between_even_places():
         saddle = HeldClip("clamped", (0.4, -0.15), at, heading=-0.8)
         model, pose, eq = solved([saddle], (0.7, 0.0), n, **held)
         given = Inputs.of(model.nominal, np.zeros((1, model.chain.n_rests)), pose.vector[None])
-        heights.append(sizes_of(Assembly(model, eq.shapes, given), "clearance")[0])
-    np.testing.assert_allclose(heights[0], heights[1][::4], atol=2.5e-4)
+        held = SolvedCable(model, given.p[0], given.rest[0], pose, eq)
+        heights.append((places_of(held, "clearance")[0], sizes_of(held.assembly, "clearance")[0]))
+    (s, coarse), fine = heights
+    np.testing.assert_allclose(coarse, np.interp(s, *fine), atol=2.5e-4)
 
 
-def test_places_and_directions_at_even_arc_lengths_are_exact_for_cubics():
-    """From those at nodes that saddles have moved either way, and not at all."""
-    chain, rng = Chain(LENGTH, 10), np.random.default_rng(0)
-    clipped = clipped_at((0.17, 0.5, 0.74))
+def test_places_and_directions_on_a_curve_through_moved_nodes_are_exact_for_cubics():
+    """Through nodes that saddles have moved either way, and not at all; and as they move on."""
+    clipped, rng = clipped_at((0.17, 0.5, 0.74)), np.random.default_rng(0)
     assert clipped.places[0, [2, 5, 7]].tolist() == [0.17, 0.5, 0.74]
     curve = [np.polynomial.Polynomial(cubic) for cubic in rng.normal(size=(2, 4))]
 
     def rows(s):
         return np.stack([*(one(s) for one in curve), *(one.deriv()(s) for one in curve)], axis=1)
 
-    found = clipped.evenly(rows(clipped.places[0])[None, ..., None])[0, ..., 0]
-    np.testing.assert_allclose(found, rows(chain.places), atol=1e-13)
+    knots, s = clipped.places[0], np.linspace(0.0, LENGTH, 33)
+    found = NodeCurve.of(LENGTH, rows(knots), knots)
+    np.testing.assert_allclose(np.hstack(found.frame(s, 1)), rows(s), atol=1e-13)
+    # Knots that move along the same cubic change nothing.
+    bends = np.stack([one.deriv(2)(knots) for one in curve], axis=1)
+    along = np.hstack([rows(knots)[:, 2:], bends])
+    rate = rng.normal(size=(len(knots), 1))
+    still = found.moved(s, along[..., None] * rate[..., None], rate, marked=True)
+    np.testing.assert_allclose(still, 0.0, atol=1e-11)
 
 
 def test_rest_curvature_between_moved_nodes_is_exact_for_parabolas():

@@ -231,7 +231,8 @@ class Shape(ShapeInMotion):
         return self._along(self._measured)
 
     def _along(self, held: SolvedCable) -> CableCurve:
-        return CableCurve.of(self.free_length, held.curve.along(self.free_length).numbers)
+        curve = held.curve.along(self.free_length)
+        return CableCurve(curve.length, curve.nodes, curve.slopes, curve.knots)
 
     @property
     def free_length(self) -> float:

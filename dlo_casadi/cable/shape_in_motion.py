@@ -133,7 +133,7 @@ def nodes_of(shape: ShapeInMotion) -> tuple[FloatArray, FloatArray]:
     model, eq = shape.cable.model, shape.equilibrium
     given = Inputs.of(shape.cable.p, shape.cable.rest, shape.pose.vector[None])
     found = Assembly(model, eq.shapes, given)
-    return found.clipped.places[0], found.at_nodes()[0][0]
+    return found.clipped.places[0], found.nodes()[0]
 
 
 def anchors_of(shape: ShapeInMotion) -> Anchors:

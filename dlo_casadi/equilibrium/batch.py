@@ -399,8 +399,8 @@ class BatchEquilibrium:
         changes: FloatArray = np.zeros((self.m, 0, along.x.shape[3]))
         if self.wrenches:
             felt, changes = here.readings(), here.readings_along(along)
-        ends = here.ends_along(along) if self.model.slides else repeat(None)
-        each = zip(curves_of(here), felt, moved, changes, ends, strict=False)
+        knots = here.knots_along(along) if self.model.moves_nodes else repeat(None)
+        each = zip(curves_of(here), felt, moved, changes, knots, strict=False)
         return [
             (Observed(curve, readings), ObservedChange(*change))
             for curve, readings, *change in each

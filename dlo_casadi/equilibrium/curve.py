@@ -1,7 +1,7 @@
 """A curve through nodes, projections of points onto it, and predicted measurements of a pose."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import repeat
 from typing import Self
@@ -30,31 +30,33 @@ class NodeCurve:
     With derivatives the curve is the cubic Hermite interpolant, which differs from an arc of
     curvature k by less than h^4 k^3 / 384; without them it consists of chords.
 
-    Places on it are arc lengths of what is between its ends, scaled to `length`. `ends` (2,) [m]:
-    arc lengths of its ends on the cable, where that is fed; else None, which is 0 and `length`.
+    `knots` (n + 1,) [m]: arc lengths of the nodes on the cable, to which dr/ds belong, if some are
+    moved to clips or the cable is fed; else None: even ones from 0 to `length`. Places on the curve
+    are arc lengths of what is between its ends, scaled to `length`.
     """
 
     length: float
     nodes: FloatArray
     slopes: FloatArray | None
-    ends: FloatArray | None = None
+    knots: FloatArray | None = None
 
     @classmethod
-    def of(cls, length: float, z: FloatArray, ends: FloatArray | None = None) -> Self:
+    def of(cls, length: float, z: FloatArray, knots: FloatArray | None = None) -> Self:
         """Curve from rows of places, or of places and dr/ds: (n + 1, d or 2 d), d = 2 or 3."""
         if z.shape[1] < 4:
-            return cls(length, z, None)
+            return cls(length, z, None, knots)
         d = z.shape[1] // 2
-        return cls(length, z[:, :d], z[:, d:], ends)
+        return cls(length, z[:, :d], z[:, d:], knots)
 
     def places_of(self, s: FloatArray) -> FloatArray:
-        """Places (K,) [m] of arc lengths s on the cable, see `ends`."""
-        return s if self.ends is None else between(s, self.ends, self.length)
+        """Places (K,) [m] of arc lengths s on the cable, see `knots`."""
+        return s if self.knots is None else between(s, self.knots[[0, -1]], self.length)
 
     def along(self, length: float) -> Self:
         """The same curve by arc lengths of a cable of another length [m]."""
-        slopes = None if self.slopes is None else self.slopes * (self.length / length)
-        return type(self)(length, self.nodes, slopes)
+        if self.knots is not None or self.slopes is None:
+            return replace(self, length=length)
+        return replace(self, length=length, slopes=self.slopes * (self.length / length))
 
     @property
     def numbers(self) -> FloatArray:
@@ -82,23 +84,38 @@ class NodeCurve:
 
     def _local(self, s: FloatArray) -> tuple[IntArray, FloatArray]:
         """Element index (K,) and the fraction (K,) of its length at s [m]."""
-        u = s * (self.n / self.length)
-        e = np.minimum(np.maximum(u.astype(np.intp), 0), self.n - 1)
-        return e, u - e
+        if self.knots is None:
+            u = s * (self.n / self.length)
+            e = np.minimum(np.maximum(u.astype(np.intp), 0), self.n - 1)
+            return e, u - e
+        at = self.knots[0] + s * self._between
+        e = np.searchsorted(self.knots[1:-1], at, side="right")
+        return e, (at - self.knots[e]) / self._sizes[e]
+
+    @cached_property
+    def _sizes(self) -> FloatArray:
+        """Arc lengths (n,) [m] of the elements on the cable."""
+        if self.knots is None:
+            return np.full(self.n, self.length / self.n)
+        return np.diff(self.knots)
+
+    @property
+    def _between(self) -> float:
+        """Arc length between the ends over `length`."""
+        return 1.0 if self.knots is None else float(self.knots[-1] - self.knots[0]) / self.length
 
     @cached_property
     def _polynomials(self) -> FloatArray:
         """Coefficients (4, d, n) of the positions in each element, by powers of u."""
-        h = self.length / self.n
-        slopes = np.zeros_like(self.nodes) if self.slopes is None else self.slopes * h
-        handles = [self.nodes[:-1], self.nodes[1:], slopes[:-1], slopes[1:]]
+        slopes, h = self.nodes if self.slopes is None else self.slopes, self._sizes[:, None]
+        handles = [self.nodes[:-1], self.nodes[1:], slopes[:-1] * h, slopes[1:] * h]
         return np.ascontiguousarray((self._table @ np.stack(handles, axis=1)).transpose(1, 2, 0))
 
     def frame(self, s: FloatArray, derivatives: int) -> list[FloatArray]:
         """Position (K, d) [m] and its first derivatives by s, at most two, at arc lengths s."""
         e, u = self._local(s)
         once, by_u, square, cube = self._polynomials.take(e, axis=2)
-        found, scale = [((cube * u + square) * u + by_u) * u + once], self.n / self.length
+        found, scale = [((cube * u + square) * u + by_u) * u + once], self._between / self._sizes[e]
         if derivatives > 0:
             found.append(scale * ((3 * cube * u + 2 * square) * u + by_u))
         if derivatives > 1:
@@ -110,22 +127,33 @@ class NodeCurve:
         return self.frame(s, derivative)[derivative]
 
     def moved(
-        self, s: FloatArray, change: FloatArray, ends: FloatArray | None = None
+        self,
+        s: FloatArray,
+        change: FloatArray,
+        knots: FloatArray | None = None,
+        *,
+        marked: bool = False,
     ) -> FloatArray:
         """Change (K, d, q) [m] at fixed s, from the change (n + 1, d or 2 d, q) of `numbers`.
 
-        Given the change (2, q) [m] of its `ends`, that of the points of the cable that are there.
+        Also from the change (n + 1, q) [m] of the `knots`; or, if `marked`, the change of the
+        points of the cable that are at s now.
         """
         e, u = self._local(s)
         w = (np.vander(u, 4, increasing=True) @ self._table)[:, :, None, None]
         out = w[:, 0] * change[e, : self.d] + w[:, 1] * change[e + 1, : self.d]
+        h = self._sizes[e][:, None, None]
         if self.slopes is not None:
-            h = self.length / self.n
             out += h * (w[:, 2] * change[e, self.d :] + w[:, 3] * change[e + 1, self.d :])
-        if ends is not None and self.ends is not None:
+        if knots is not None and self.knots is not None:
             share = (s / self.length)[:, None]
-            passed = ((1 - share) * ends[0] + share * ends[1]) / (self.ends[1] - self.ends[0])
-            out -= self.length * self.at(s, 1)[..., None] * passed[:, None]
+            goes = 0.0 if marked else (1 - share) * knots[0] + share * knots[-1]
+            longer = knots[e + 1] - knots[e]
+            passed = (goes - knots[e] - u[:, None] * longer) / self._between
+            out += self.at(s, 1)[..., None] * passed[:, None]
+            if self.slopes is not None:
+                first, last = self.slopes[e][..., None], self.slopes[e + 1][..., None]
+                out += (w[:, 2] * first + w[:, 3] * last) * longer[:, None]
         return np.asarray(out)
 
     def followed(
@@ -252,16 +280,17 @@ class Observed:
 class ObservedChange:
     """Change of an `Observed` along q directions.
 
-    `curve` (n + 1, d or 2 d, q), `readings` (n_reactions, q); `ends` (2, q) [m] of the curve's ends
-    on the cable, where that is fed.
+    `curve` (n + 1, d or 2 d, q), `readings` (n_reactions, q); `knots` (n + 1, q) [m] of the curve,
+    where nodes are moved to clips, or the cable is fed.
     """
 
     curve: FloatArray
     readings: FloatArray
-    ends: FloatArray | None = None
+    knots: FloatArray | None = None
 
 
 def curves_of(found: Assembly) -> list[NodeCurve]:
     """Measured curves of m shapes."""
-    length, ends = found.model.cable.length, found.ends if found.model.slides else repeat(None)
-    return [NodeCurve.of(length, z, own) for z, own in zip(found.curve(), ends, strict=False)]
+    length = found.model.cable.length
+    knots = found.clipped.places if found.model.moves_nodes else repeat(None)
+    return [NodeCurve.of(length, z, own) for z, own in zip(found.curve(), knots, strict=False)]

@@ -65,7 +65,8 @@ def places_of(held: SolvedCable, quantity: str) -> tuple[FloatArray, list[str]]:
     there = held.assembly
     if quantity == "clearance":
         names, deep = _depths(there)
-        along = np.linspace(0.0, held.model.cable.length, deep.shape[2])
+        nodes, every = there.clipped.places[0], np.arange(deep.shape[2]) / 4
+        along = np.interp(every, np.arange(len(nodes)), nodes)
         return along, [names[k] for k in deep[:, 0].argmax(axis=0)]
     bends = quantity == "curvature"
     places = places_along(there.clipped)[0] if bends else there.clipped.cells[0].mean(axis=1)
@@ -115,14 +116,10 @@ def _depths(found: Assembly) -> tuple[list[str], FloatArray]:
 def _along(found: Assembly) -> FloatArray:
     """Places (m, K, d) [m] along cables, four per element, interpolated from their nodes."""
     model, points, x = found.model, found.nodes(), found.shapes.x
-    if model.moves_nodes:  # `points` are even
-        each = zip(found.clipped.even, found.clipped.places, x, strict=True)
-        x = np.array([model.node.interpolated(*own) for own in each])
-    size = np.diff(found.clipped.held[:, [0, -1]]) / model.n
-    slopes = size[..., None] * tangents(model.node, x)
+    size, ways = np.diff(found.clipped.places)[..., None, None], tangents(model.node, x)
     u = np.arange(4)[:, None] / 4
     start, end = points[..., :-1, None, :], points[..., 1:, None, :]
-    out, into = slopes[..., :-1, None, :], slopes[..., 1:, None, :]
+    out, into = size * ways[..., :-1, None, :], size * ways[..., 1:, None, :]
     bulge = u * (1 - u) * ((1 - u) * (out - (end - start)) - u * (into - (end - start)))
     inner = start + u * (end - start) + bulge
     flat = inner.reshape((*points.shape[:-2], -1, points.shape[-1]))

@@ -275,7 +275,7 @@ class Repeats:
         ((seen, change),) = self._batch.observe(*given, self.along)
         curve, d = seen.curve, seen.curve.d
         alike = np.broadcast_to(self.uncertainty.repeat_std * np.eye(d), (len(s), d, d))
-        return curve, np.concatenate([curve.moved(s, change.curve), alike], axis=2)
+        return curve, np.concatenate([curve.moved(s, change.curve, change.knots), alike], axis=2)
 
     @property
     def reading_std(self) -> FloatArray:

@@ -257,11 +257,14 @@ class _BatchNlp:
         out: list[FloatArray] = []
         unit, seen = np.eye(self.n_z), problem.observed(point)
         for j, s, white in zip(problem.used, point.projections, problem.whitening, strict=True):
-            curve, readings, held = seen[j].curve.numbers, seen[j].readings, seen[j].curve.ends
-            held = np.zeros(0) if held is None else held
+            curve, readings, knots = seen[j].curve.numbers, seen[j].readings, seen[j].curve.knots
+            held = np.zeros(0) if knots is None else knots[[0, -1]]
             by_curve, by_ends, by_readings = np.split(unit, [curve.size, curve.size + held.size])
             by_curve = by_curve.reshape((*curve.shape, self.n_z))
-            each = ObservedChange(by_curve, by_readings, by_ends if held.size else None)
+            # Nodes of a cable without clips are even between its ends.
+            u = np.linspace(0.0, 1.0, len(curve))[:, None]
+            laid = (1 - u) * by_ends[:1] + u * by_ends[1:] if held.size else None
+            each = ObservedChange(by_curve, by_readings, laid)
             residual, change = problem.measured[j].linearized(seen[j], s, each)
             rows = -white @ change
             target = white @ residual + rows @ np.concatenate([curve.ravel(), held, readings])

@@ -192,7 +192,7 @@ def _kinematic_step(
     weight = 0.003 / (0.3 * model.cable.curvature_scale * chain.h)
     rough = weight * np.kron(np.diff(np.eye(n), n=2, axis=0), np.eye(b))
     if item.has_line:
-        towards = [*curve.moved(s, slopes).transpose((1, 0, 2))]
+        towards = [*curve.moved(s, slopes, change.knots).transpose((1, 0, 2))]
         gaps = [*(item.points - curve.at(s)).T]
     else:  # a single photograph does not show depth
         on = item.on_points

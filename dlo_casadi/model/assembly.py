@@ -15,7 +15,7 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray, IntArray
 from dlo_casadi.model.clipped import NONE, by_axes
-from dlo_casadi.model.clips import ClipLoad, tangents
+from dlo_casadi.model.clips import ClipLoad
 from dlo_casadi.model.contact import Contact
 from dlo_casadi.model.evaluation import Evaluation
 from dlo_casadi.model.functions import functions_of
@@ -260,34 +260,20 @@ class Assembly(Evaluation):
         mean = (rates[:, 1:] + rates[:, :-1]) / 2
         return places, np.concatenate([rates[:, :1], mean, rates[:, -1:]], axis=1)
 
-    def at_nodes(self) -> tuple[FloatArray, FloatArray]:
-        """True places [m] and rates of the element boundaries as they are, see `_stations`."""
-        (advance,) = self._call_segments("segment_curve")
-        return self._stations(advance[..., 0], self.given.poses[:, : self.model.node.dimension])
-
     def nodes(self) -> FloatArray:
-        """True places (m, n + 1, dimension) [m] of the element boundaries, evenly spaced."""
-        node, clipped = self.model.node, self.clipped
-        places, rates = self.at_nodes()
-        if not clipped.moved:
-            return places
-        moved = np.concatenate([places, rates[..., :1] * tangents(node, self.shapes.x)], axis=2)
-        return clipped.evenly(moved[..., None])[:, :, : node.dimension, 0]
+        """True places (m, n + 1, dimension) [m] of the element boundaries."""
+        (advance,) = self._call_segments("segment_curve")
+        return self._stations(advance[..., 0], self.given.poses[:, : self.model.node.dimension])[0]
 
     def curve(self) -> FloatArray:
         """Measured places (m, n + 1, d), for smooth elements with dr/ds (m, n + 1, 2 d)."""
         (advance,) = self._call_segments("segment_curve")
         (rows,) = self._call_stations("station", advance)
-        return self.clipped.evenly(rows)[..., 0]
+        return rows[..., 0]
 
-    @property
-    def ends(self) -> FloatArray:
-        """Arc lengths (m, 2) [m] of both ends on the cable: 0 and its length, unless it is fed."""
-        return self.clipped.held[:, [0, -1]]
-
-    def ends_along(self, along: Tangents) -> FloatArray:
-        """Change (m, 2, q) [m] of `ends` along directions."""
-        return self._slips_of(along)[:, [0, -1]]
+    def knots_along(self, along: Tangents) -> FloatArray:
+        """Change (m, n + 1, q) [m] of the arc lengths of the nodes along directions."""
+        return self.clipped.at_nodes(self._slips_of(along))
 
     def _call_stations(self, name: str, advance: FloatArray) -> list[FloatArray]:
         model, (m, count) = self.model, (len(advance), self.model.chain.n + 1)
@@ -302,21 +288,19 @@ class Assembly(Evaluation):
         """`curve`, and its change (m, n + 1, d or 2 d, q) along directions."""
         advance, by_moving, by_others = self._call_segments("segment_curve_slopes")
         rows, by_station, by_p = self._call_stations("station_slopes", advance)
-        model, clipped, both = self.model, self.clipped, 2 * self.model.node.increment
+        model, both = self.model, 2 * self.model.node.increment
         by_nodes, by_lam = np.split(by_moving, [both], axis=-1)
         lam = self.touching.lam_along(along.lam) if self.touching else along.lam[:, None]
-        x = clipped.free(along.x) + self._by_turns(along.p)
+        x = self.clipped.free(along.x) + self._by_turns(along.p)
         steps: FloatArray = by_nodes @ self._both(x) + by_lam @ lam
-        steps, rate = self._by_numbers(by_others, along, steps), self._slips_of(along)
-        steps += self._by_slips("curve_by_edges", rate)
+        steps = self._by_numbers(by_others, along, steps)
+        steps += self._by_slips("curve_by_edges", self._slips_of(along))
         start = np.zeros((len(steps), model.node.dimension, steps.shape[3]))
         places, rates = self._stations(steps, start)
         shape = (len(steps), model.chain.n + 1, both, steps.shape[3])
         own = x[:, model.chain.layout.stations].reshape(shape)
         moved = by_station @ np.concatenate([places, rates, own], axis=2)
-        change = clipped.evenly(moved + by_p @ along.p[:, None])
-        change += clipped.evenly_along(rows, rate)
-        return clipped.evenly(rows)[..., 0], np.asarray(change)
+        return rows[..., 0], np.asarray(moved + by_p @ along.p[:, None])
 
     def reactions(self, name: str = "reactions") -> FloatArray:
         """Forces and moments (m, n_reactions) of the cable on its fixtures, `reaction_rows`."""

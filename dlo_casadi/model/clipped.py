@@ -8,13 +8,12 @@ segments by these numbers are the same as by any other.
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from dlo_casadi.arrays import BoolArray, FloatArray, IntArray, cross
 from dlo_casadi.model.clips import ClipLoad, moved_with, placed_nodes
-from dlo_casadi.model.slides import Ends
 from dlo_casadi.rod.band import BandMatrix, Vector
 from dlo_casadi.rod.chain import Chain, with_cells_beyond
 from dlo_casadi.rod.node import Node
@@ -299,106 +298,6 @@ class Clipped:
             )
             for each in zip(self.at, forces, moments, strict=True)
         ]
-
-    @property
-    def even(self) -> FloatArray:
-        """Even arc lengths (m, n + 1) [m] from the start to the end."""
-        if not any(self.loose):
-            return np.tile(self.chain.places, (len(self.held), 1))
-        share = self.chain.places / self.chain.length
-        return self.held[:, :1] + self._scale * self.chain.length * share
-
-    @property
-    def _scale(self) -> FloatArray:
-        """Arc length between the ends over the declared length (m, 1)."""
-        return (self.held[:, -1:] - self.held[:, :1]) / self.chain.length
-
-    def evenly(self, stations: FloatArray) -> FloatArray:
-        """Places and dr/ds (m, n + 1, 2 d, q) at even arc lengths, given those at the nodes.
-
-        Where ends slide, s is the share of the cable between them times its declared length.
-        """
-        out = stations.copy()
-        if self.kinds:
-            own = self._evened
-            (r0, t0), (r1, t1) = own.beside(stations)
-            chord, u, v, width = r1 - r0, own.u, 1 - own.u, own.width
-            place = r0 + u**2 * (3 - 2 * u) * chord + width * u * v * (v * t0 - u * t1)
-            slope = 6 * u * v * chord / width + v * (1 - 3 * u) * t0 + u * (3 * u - 2) * t1
-            out[own.at] = np.concatenate([place, slope], axis=2)
-        if any(self.loose):
-            out[:, :, out.shape[2] // 2 :] *= self._scale[..., None, None]
-        return out
-
-    def evenly_along(self, stations: FloatArray, rate: FloatArray) -> FloatArray:
-        """Change of `evenly` (m, n + 1, 2 d, q) as supports slide by `rate` (m, k + 2, q) [m]."""
-        if not self.moved:
-            return NONE
-        (m, count, size, _), out = stations.shape, NONE
-        if self.kinds:
-            own, moved = self._evened, self.at_nodes(rate)
-            out = np.zeros((m, count, size, rate.shape[2]))
-            low, high = moved[own.rows, own.element], moved[own.rows, own.element + 1]
-            share = (self.chain.places[own.nodes] / self.chain.length)[..., None]
-            goes = rate[:, :1] + share * (rate[:, -1:] - rate[:, :1])
-            dw, u, v, width = (high - low)[:, :, None], own.u, 1 - own.u, own.width
-            du = ((goes - low)[:, :, None] - u * dw) / width
-            (r0, t0), (r1, t1) = own.beside(stations)
-            chord = (r1 - r0) / width
-            place = u * v * (v * t0 - u * t1) * dw
-            place = place + (6 * u * v * chord + v * (1 - 3 * u) * t0 + u * (3 * u - 2) * t1) * (
-                width * du
-            )
-            bend = 6 * (1 - 2 * u) * chord + (6 * u - 4) * t0 + (6 * u - 2) * t1
-            slope = bend * du - 6 * u * v * chord * dw / width
-            out[own.at] = np.concatenate([place, slope], axis=2)
-        if any(self.loose):
-            d, scale = size // 2, self._scale[..., None, None]
-            longer = ((rate[:, -1:] - rate[:, :1]) / self.chain.length)[:, :, None]
-            slopes = self.evenly(stations)[:, :, d:] / scale * longer
-            own_slopes = out[:, :, d:] * scale if self.kinds else 0.0
-            places = out[:, :, :d] if self.kinds else np.zeros_like(slopes)
-            out = np.concatenate([places, slopes + own_slopes], axis=2)
-        return out
-
-    @property
-    def _evened(self) -> "_Evened":
-        """Nodes that do not stand at even places: those of clips, or all if ends slide, too."""
-        m, n = len(self.held), self.chain.n
-        nodes = np.tile(np.arange(1, n), (m, 1)) if any(self.loose) else self.nodes
-        rows = np.arange(m)[:, None]
-        s = self.even[rows, nodes]
-        element = (self.places[:, None] <= s[..., None]).sum(axis=2) - 1
-        width = self.places[rows, element + 1] - self.places[rows, element]
-        u = (s - self.places[rows, element]) / width
-        return _Evened(nodes, element, u[..., None, None], width[..., None, None])
-
-
-class _Evened(NamedTuple):
-    """Nodes (m, N) of even places: the elements (m, N) in which these are, shares and lengths.
-
-    `u`, `width` (m, N, 1, 1): the share of an element that is before the place, its length [m].
-    """
-
-    nodes: IntArray
-    element: IntArray
-    u: FloatArray
-    width: FloatArray
-
-    @property
-    def rows(self) -> IntArray:
-        """Indices of the poses (m, 1)."""
-        return np.arange(len(self.nodes))[:, None]
-
-    @property
-    def at(self) -> Ends:
-        """Indices of these nodes."""
-        return self.rows, self.nodes
-
-    def beside(self, stations: FloatArray) -> list[list[FloatArray]]:
-        """Places and dr/ds (m, N, d, q) at both ends of the elements."""
-        both = (stations[self.rows, self.element + j] for j in (0, 1))
-        return [np.split(one, 2, axis=2) for one in both]
 
 
 def _stepped(delta: FloatArray, step: FloatArray) -> FloatArray:

@@ -213,9 +213,6 @@ def curve(model: CableModel, s: PoseSymbols) -> ca.SX:
     steps = advance[:, layout.advancing.tolist()]
     points = ca.cumsum(ca.horzcat(s.pose[:d], steps[:d, :]), 1)
     rates = steps[d:, :]
-    if model.slides:
-        places = Laid.of(model).places(model, s)
-        rates = rates * ((places[-1] - places[0]) / model.chain.length)
     rates = ca.horzcat(rates[:, 0], (rates[:, :-1] + rates[:, 1:]) / 2, rates[:, -1])
     first, last = layout.stations.T.tolist()
     x = ca.reshape(s.x, model.node.coordinates, model.chain.n_nodes)

@@ -66,7 +66,7 @@ class Anchors:
         pull = beyond.summed(lam)[0][:, beyond.rows[1]]
         if model.end_pull:
             pull = pull - eq.multipliers[model.end_pull]
-        places = own.at_nodes()[0][0, nodes]
+        places = own.nodes()[0, nodes]
         return cls(clipped.places[0], nodes, places, x[nodes], blocked, pull)
 
     def released(self) -> Anchors:

@@ -149,7 +149,7 @@ class Pixels(Sensor):
     ) -> tuple[FloatArray, FloatArray]:
         """Residual (K,) [m] and its change (K, q) along directions."""
         away, by = self._compared(seen.curve, places)
-        moved = seen.curve.moved(places, along.curve)
+        moved = seen.curve.moved(places, along.curve, along.knots)
         return away, np.einsum("kd,kdq->kq", by, moved)
 
     def whitening(self, noise: NoiseModel, places: FloatArray) -> FloatArray:

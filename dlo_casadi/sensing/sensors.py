@@ -139,8 +139,7 @@ class _Points(Sensor):
     ) -> tuple[FloatArray, FloatArray]:
         """Residual (R,) [m] and its change (R, q) along directions."""
         gap = self.points - seen.curve.at(places)
-        ends = along.ends if self.marked else None
-        moved = -seen.curve.moved(places, along.curve, ends)
+        moved = -seen.curve.moved(places, along.curve, along.knots, marked=self.marked)
         both = self.components(seen.curve, places, np.dstack([gap, moved]))
         return both[:, 0], both[:, 1:]
 

@@ -140,8 +140,9 @@ class Measured:
 
     def along(self, seen: Observed, change: ObservedChange) -> FloatArray:
         """Derivatives (R, q) of what is predicted, in units of the noise."""
-        ends = change.ends if self.marked else None
-        rows = self._rows(seen, seen.curve.moved(self._places(seen), change.curve, ends))
+        known = change.curve, change.knots
+        moved = seen.curve.moved(self._places(seen), *known, marked=self.marked)
+        rows = self._rows(seen, moved)
         if not self.rows:
             return rows
         return np.vstack([rows, change.readings[self.rows] / self.std[:, None]])
