@@ -442,6 +442,19 @@ def test_places_and_directions_on_a_curve_through_moved_nodes_are_exact_for_cubi
     np.testing.assert_allclose(still, 0.0, atol=1e-11)
 
 
+def test_points_beside_a_saddle_between_even_places():
+    """The curvature jumps there; points between nodes converge with the fourth order, as others."""
+    at, places = HeldClip("clamped", (0.42, -0.12), 0.524, heading=-0.3), []
+    for n in (20, 40, 160):
+        held = {"start": "clamped", "end": "clamped", "start_heading": 0.3, "end_heading": 0.2}
+        model, pose, eq = solved([at], (0.8, 0.0), n, **held)
+        shape = SolvedCable(model, model.nominal, np.zeros(n), pose, eq)
+        places.append(shape.curve.at(np.linspace(0.0, LENGTH, 401)))
+    errors = [np.abs(one - places[-1]).max() for one in places[:2]]
+    assert errors[0] < 1e-4
+    assert errors[1] < errors[0] / 12
+
+
 def test_rest_curvature_between_moved_nodes_is_exact_for_parabolas():
     """kappa_0 = a + b s + c s^2: mean, slope and bend times the width, of the moved cells."""
     model, (a, b, c) = CableModel(CABLE, 10, n_rest=0, clips=("pinned",) * 2), (1.0, -4.0, 9.0)
