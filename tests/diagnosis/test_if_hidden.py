@@ -57,6 +57,11 @@ def test_a_weight_that_fits_as_well_as_none_widens_the_interval_of_the_stiffness
     told = found.telling
     assert told.reading.name.startswith("start_"), "the tip is free"
     assert told.difference < fit.expected_error, "another pose would not tell"
+    assert found.motion is None
+    motion = found.with_motion().motion
+    assert motion.at == pytest.approx(0.65), "it is let go from its tip"
+    assert set(motion.rivals) == {found.effect}
+    assert motion.rivals[found.effect].separation > NORMAL_95
 
     force = next(c for c in candidates(MODEL, setup_of(MODEL)) if c.name == "point_force")
     model = force.add_to(MODEL)

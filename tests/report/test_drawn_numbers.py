@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from test_figures import LOAD, with_readings
-from test_page import PROPOSAL
+from test_page import MOTION, PROPOSAL
 
 from dlo_casadi.arrays import chord_lengths
 from dlo_casadi.report import figures
@@ -109,8 +109,12 @@ def test_forces_come_before_moments():
 
 
 def test_findings_of_a_diagnosis_are_in_the_report(outcome):
-    report = report_dict(replace(outcome, unexplained=LOAD, next_pose=PROPOSAL))
+    found = replace(outcome, unexplained=LOAD, next_pose=PROPOSAL, next_motion=MOTION)
+    report = report_dict(found)
     assert tuple(report["unexplained"]["interval_95"]) == LOAD.interval
     assert report["next_pose"]["expected_difference_m"] == PROPOSAL.difference
     assert report["next_pose"]["expected_difference_std"] == PROPOSAL.separation
+    assert report["next_motion"]["aside_m"] == MOTION.aside
+    rival = report["next_motion"]["rivals"]["point_force"]
+    assert rival["expected_difference_std"] == MOTION.rivals["point_force"].separation
     assert report["repeatability"]["held_out_inside_90"] == outcome.inside_band

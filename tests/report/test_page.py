@@ -16,6 +16,7 @@ from test_figures import CANDIDATES, EFFECT, LOAD, with_readings
 
 from dlo_casadi.cable.estimate import Estimate
 from dlo_casadi.diagnosis.next_measurement import NextPose, NextReading
+from dlo_casadi.diagnosis.next_motion import NextMotion, Swing
 from dlo_casadi.report import canvas, figures
 from dlo_casadi.report.page import (
     breakable,
@@ -43,6 +44,15 @@ PROPOSAL = NextPose(
     times=1,
     reading=NextReading("end_force", 0.3, 4.0, 2),
     separates=("lumped_mass", "point_force"),
+)
+MOTION = NextMotion(
+    pose="pose_01",
+    at=0.8,
+    aside=0.2,
+    duration=3.0,
+    frequencies=(0.741, 2.32, 5.39),
+    rivals={"point_force": Swing((0.77, 2.4, 5.5), 11.2), "tether": Swing((0.74, 2.33, 5.4), 1.1)},
+    of="lumped_mass",
 )
 
 

@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 from small_sessions import context
 from test_figures import EFFECT, LOAD
-from test_page import PROPOSAL
+from test_page import MOTION, PROPOSAL
 
 from dlo_casadi.cable.estimate import Estimate
 from dlo_casadi.diagnosis.selection import Ranked
@@ -124,6 +124,7 @@ def test_an_added_effect_is_told_with_its_rivals(outcome):
             effects=(EFFECT,),
             verdict="effect_found",
             next_pose=PROPOSAL,
+            next_motion=MOTION,
         )
     )
 
@@ -136,6 +137,11 @@ def test_an_added_effect_is_told_with_its_rivals(outcome):
         "hold the end at (0.100, -0.200) m; they differ there by 2.5 mm RMS, 8.2 standard" in text
     )
     assert "one measurement suffices" in text
+    assert (
+        "To tell lumped_mass by a motion: hold the ends as in pose_01, pull the cable aside by "
+        "0.2 m at 0.8 m from the start, and let it swing; it swings at 0.741, 2.32, 5.39 Hz and "
+        "differs in 3 s from point_force by 11 standard deviations (0.77, 2.4, 5.5 Hz)." in text
+    ), "a tether would not be told apart"
     assert "cross-validated" in text
     assert "with lumped_mass" in text
 
