@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from numbers import Real
 from typing import Any, Self
 
 import casadi as ca
@@ -13,6 +14,7 @@ from numpy.typing import ArrayLike
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.estimate import Estimate, EstimatedCable
 from dlo_casadi.cable.held import HELD, held_pose
+from dlo_casadi.cable.move_checks import number
 from dlo_casadi.cable.saved import parameters_hash
 from dlo_casadi.cable.shape_in_motion import ShapeInMotion, moving_cable
 from dlo_casadi.cable.simulated import Motion, begun, on_the_mesh_of
@@ -24,6 +26,7 @@ from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import DAMPING_TIME, CableModel
 from dlo_casadi.motion.equations import motion_equations
 from dlo_casadi.motion.path import FixturePath
+from dlo_casadi.motion.segment import refuse_still
 from dlo_casadi.motion.step_function import step_function
 from dlo_casadi.motion.trajectory import TOLERANCE, way_of
 
@@ -48,6 +51,14 @@ class CableInMotion(EstimatedCable):
         """
         known = dict(zip(self.model.names, self.p.tolist(), strict=True))
         model, added = self.model, {}
+        labels = [effect.label for effect in model.effects]
+        for name, value in {DAMPING_TIME: damping_time, **effects}.items():
+            if value is None:
+                continue
+            if isinstance(value, bool) or not isinstance(value, Real):
+                raise DloError(f"{name}: a number belongs here, found {value!r}")
+            if name in labels or name in known:
+                raise DloError(f"{name}: {self.name!r} has it already")
         if damping_time is not None:
             model = replace(model, cable=replace(model.cable, damping_time=float(damping_time)))
             added[DAMPING_TIME] = damping_time
@@ -135,9 +146,11 @@ class CableInMotion(EstimatedCable):
         DloError
             If dt is no time, or if motion does not know a part of the cable.
         """
-        if not (isinstance(dt, int | float) and np.isfinite(dt) and dt > 0):
+        if isinstance(dt, bool) or not isinstance(dt, Real) or not 0 < float(dt) < np.inf:
             raise DloError(f"dt: a time [s] above zero belongs here, found {dt!r}")
         if about is not None:
+            if not isinstance(about, ShapeInMotion):
+                raise DloError(f"about: a shape of cable.solve belongs here, found {about!r}")
             held = self.with_clips([clip.kind for clip in about.pose.clips])
             moving = moving_cable(held, (about.equilibrium, about.pose))
             return step_function(moving.about(about.equilibrium.x), float(dt))
@@ -193,10 +206,11 @@ class CableInMotion(EstimatedCable):
         DloError
             If times or fixtures are no such arrays, or if motion does not know a part of the cable.
         """
-        times = times_of(t)
+        times, tolerance = times_of(t), number("tolerance", tolerance)
         asked: dict[str, Any] = {"start": start, "end": end}
         asked |= {"start_heading": start_heading, "end_heading": end_heading}
         asked |= {"start_orientation": start_orientation, "end_orientation": end_orientation}
+        refuse_still(self.with_clips(()).model)
         pose, path = fixture_path(self, times, {**asked, "clips": clips})
         held = self.with_clips([clip.kind for clip in pose.clips])
         rest = solve_equilibrium(held.model, held.p, held.rest, pose)

@@ -67,12 +67,10 @@ class Modes:
         DloError
             If the name of the file does not end in .svg, or if it cannot be written.
         """
-        path = Path(path)
-        if path.suffix.lower() != ".svg":
-            raise DloError(f"{path}: a moving picture of modes is an SVG.\n  Try: modes.svg")
+        file = svg_file(path)
         picture = swinging_modes(self.points, self.shapes, self.frequencies, self._names)
-        write_file(path, picture)
-        return path
+        write_file(file, picture)
+        return file
 
     @property
     def _names(self) -> list[str]:
@@ -86,6 +84,16 @@ class Modes:
             off = (f" +- {f_std:.2g}", f" +- {zeta_std:.2g}") if f_std or zeta_std else ("", "")
             lines.append(f"{f:10.4g}{off[0]} Hz  damping ratio {zeta:.3g}{off[1]}")
         return "\n".join(lines)
+
+
+def svg_file(path: str | PathLike[str]) -> Path:
+    """The name of a moving picture of modes; raises DloError if it does not end in .svg."""
+    file = Path(path)
+    if file.suffix.lower() != ".svg":
+        raise DloError(
+            f"{file}: a moving picture of modes is an SVG.\n  Try: {file.with_suffix('.svg')}"
+        )
+    return file
 
 
 class ShapeInMotion:

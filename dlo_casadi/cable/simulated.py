@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
@@ -18,18 +18,22 @@ from dlo_casadi.cable.moving_picture import draw_motion, frame_times, moving_pic
 from dlo_casadi.cable.shape_in_motion import POINTS, ShapeInMotion, anchors_of, nodes_of
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.errors import DloError
+from dlo_casadi.errors import DloError, counted
 from dlo_casadi.io.files import write_file
+from dlo_casadi.model.clipped import alike
 from dlo_casadi.motion.equations import unknowns_of
-from dlo_casadi.motion.state import State
+from dlo_casadi.motion.state import Fixtures, State
 from dlo_casadi.motion.system import MovingCable
 from dlo_casadi.motion.trajectory import Way
 
 # Distance [lengths] and angle [rad] between a shape and its fixtures from which it is another one.
 _OFF, _ASKEW = 0.01, 0.1
+# Distance [lengths] by which both ends of a shape may be nearer or farther apart than the fixtures:
+# the first step makes up for it, and has no solution from about 1e-6 on.
+_APART = 3e-7
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Motion:
     """A cable in motion.
 
@@ -56,8 +60,21 @@ class Motion:
         return self.at(self.s)
 
     def at(self, s: ArrayLike) -> FloatArray:
-        """Points (T, K, d) [m] at arc lengths s (K,) [m]."""
-        return self.way.points(self.t, np.atleast_1d(np.asarray(s, dtype=float)))
+        """Points (T, K, d) [m] at arc lengths s (K,) [m].
+
+        Raises
+        ------
+        DloError
+            If these are no arc lengths on the cable.
+        """
+        length = self.cable.length
+        try:
+            places = np.atleast_1d(np.asarray(s, dtype=float))
+        except (TypeError, ValueError):
+            places = np.full(1, np.nan)
+        if places.ndim != 1 or not (np.abs(places / length - 0.5) <= 0.5 + 1e-9).all():
+            raise DloError(f"s: arc lengths of 0 to {length:g} m belong here, found {s!r}")
+        return self.way.points(self.t, places)
 
     @cached_property
     def start_force(self) -> FloatArray:
@@ -99,9 +116,7 @@ class Motion:
         DloError
             If the name does not end in .gif, or if the file cannot be written.
         """
-        file = Path(path)
-        if file.suffix.lower() != ".gif":
-            raise DloError(f"{file}: moving pictures are GIF.\n  Try: {file.with_suffix('.gif')}")
+        file = gif_file(path)
         times = frame_times(float(self.t[0]), float(self.t[-1]))
         points = self.way.points(times, self.s)
         write_file(file, moving_picture(points, times, f"{self.cable.name}: motion", self._clips))
@@ -121,6 +136,23 @@ class Motion:
         both = zip(self.way.states, *self.way.forces, strict=True)
         return [unknowns_of(self.way.cable, state, (first, last)) for state, first, last in both]
 
+    def __repr__(self) -> str:
+        first, last, steps = self.t[0], self.t[-1], len(self.way.t) - 1
+        lines = [f"{self.cable.name}: {first:g} to {last:g} s in {counted(steps, 'step')}"]
+        ends = {"its start": self.start_force, "its end": self.end_force}
+        for where, force in {**ends, **self.clip_forces}.items():
+            largest = np.linalg.norm(force, axis=1).max()
+            lines.append(f"  largest force on {where}: {largest:.4g} N")
+        return "\n".join(lines)
+
+
+def gif_file(path: str | PathLike[str]) -> Path:
+    """The name of a moving picture; raises DloError if it does not end in .gif."""
+    file = Path(path)
+    if file.suffix.lower() != ".gif":
+        raise DloError(f"{file}: moving pictures are GIF.\n  Try: {file.with_suffix('.gif')}")
+    return file
+
 
 def begun(
     cable: EstimatedCable,
@@ -131,7 +163,12 @@ def begun(
 ) -> State:
     """The state from which a motion begins."""
     if isinstance(begins, Motion):
-        return begins.way.states[-1]
+        state = begins.way.states[-1]
+        _check_ends(moving, pose, "motion", state.r[[0, -1]], state.x)
+        x, fixtures = _in_clamps(moving, pose, state.x), _around(moving, pose, state.r)
+        if np.array_equal(x, state.x) and np.array_equal(fixtures.places[0], state.r[0]):
+            return state
+        return moving.with_places(replace(state, x=x), fixtures)
     if begins is None:
         return moving.at_rest(rest, moving.fixtures(pose.vector))
     if not isinstance(begins, ShapeInMotion):
@@ -153,11 +190,33 @@ def begun(
     if moving.anchors is not None:
         nodes = moving.anchors.held(nodes)
     near = CubicSpline(known, points)(places)
-    _check_ends(moving, pose, begins, nodes)
+    _check_ends(moving, pose, "shape", begins.equilibrium.points[[0, -1]], nodes)
     _check_clips(moving, pose, near)
     force = np.zeros((moving.n_segments, moving.d * (1 + 2 * moving.model.n_springs)))
+    nodes = _in_clamps(moving, pose, nodes)
     state = moving.still_state(nodes, force, np.zeros(moving.n_moments))
-    return moving.with_places(state, moving.fixtures(pose.vector), near)
+    return moving.with_places(state, _around(moving, pose, near), near)
+
+
+def _around(moving: MovingCable, pose: HeldPose, near: FloatArray) -> Fixtures:
+    """Fixtures that hold nodes where they are, but for a shift that brings them to the start.
+
+    `near` (n_nodes, d) [m]. What fixtures are off by then is made up in the first step.
+    """
+    fixtures = moving.fixtures(pose.vector)
+    places, shift = fixtures.places.copy(), fixtures.places[0] - near[0]
+    for k, node in moving.held[1:]:
+        places[k] = near[node] + shift
+    return replace(fixtures, places=places)
+
+
+def _in_clamps(moving: MovingCable, pose: HeldPose, x: FloatArray) -> FloatArray:
+    """Nodes (n_nodes, coordinates) with the frames of the clamps at both ends."""
+    x, model = x.copy(), moving.model
+    for kind, k, frame in zip((model.start, model.end), (0, -1), pose.frames, strict=True):
+        if kind.rotations(model.node).all():
+            x[k] = alike(np.array([frame]), x[[k]])[0]
+    return x
 
 
 def on_the_mesh_of(begins: ShapeInMotion | Motion | None, cable: MovingCable) -> MovingCable:
@@ -194,25 +253,33 @@ def _check_clips(moving: MovingCable, pose: HeldPose, near: FloatArray) -> None:
 
 
 def _check_ends(
-    moving: MovingCable, pose: HeldPose, begins: ShapeInMotion, nodes: FloatArray
+    moving: MovingCable, pose: HeldPose, what: str, points: FloatArray, nodes: FloatArray
 ) -> None:
-    """Raise an error if fixtures hold the cable elsewhere than the shape is."""
-    model, points = moving.model, begins.equilibrium.points
+    """Raise an error if fixtures hold the cable elsewhere than what it begins with.
+
+    `points` (2, d) [m] of its ends; `nodes` (n_nodes, coordinates).
+    """
+    model = moving.model
     sides = zip(("start", "end"), (model.start, model.end), (0, -1), pose.frames, strict=True)
     for side, kind, k, frame in sides:
-        place = getattr(pose, side)
-        if (
-            kind.place
-            and (off := float(np.linalg.norm(points[k] - place))) > _OFF * model.cable.length
-        ):
+        place, length = getattr(pose, side), model.cable.length
+        if kind.place and (off := float(np.linalg.norm(points[k] - place))) > _OFF * length:
             raise DloError(
-                f"begins: the {side} of the shape is {1e3 * off:.3g} mm from its fixture.\n"
+                f"begins: the {side} of the {what} is {1e3 * off:.3g} mm from its fixture.\n"
                 f"  Try: {side}={tuple(np.round(points[k], 6).tolist())} at the first instant."
             )
         turn = model.node.difference(frame, nodes[k])[kind.rotations(model.node)]
         if np.abs(turn).max(initial=0.0) > _ASKEW:
             raise DloError(
-                f"begins: the shape leaves its clamp at the {side} turned by "
-                f"{np.abs(turn).max():.3g} rad.\n  Try: the clamp's direction of the shape, at the "
-                "first instant."
+                f"begins: the {what} leaves its clamp at the {side} turned by "
+                f"{np.abs(turn).max():.3g} rad.\n  Try: the clamp's direction of the {what}, at "
+                "the first instant."
+            )
+    if pose.end is not None:
+        apart = np.subtract(pose.end, pose.start)
+        if (off := float(np.linalg.norm(points[1] - points[0] - apart))) > _APART * length:
+            start, end = (tuple(x.tolist()) for x in points)
+            raise DloError(
+                f"begins: from start to end the {what} is {1e3 * off:.3g} mm off its fixtures.\n"
+                f"  Try: start={start}, end={end} at the first instant."
             )

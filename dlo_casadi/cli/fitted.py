@@ -361,7 +361,13 @@ def _poses(cable: FittedCable, chosen: argparse.Namespace) -> Grid | PoseList:
     PARAMETERS,
     option("--output", type=Path, required=True, help="folder for the C files"),
     option("--prefix", default="dlo", help="begins all public names (dlo)"),
-    option("--clips", nargs="+", default=(), choices=CLIPS, help="what holds it between"),
+    option(
+        "--clips",
+        nargs="+",
+        default=(),
+        choices=[str(kind) for kind in CLIPS],
+        help="what holds it between",
+    ),
     option(
         "--obstacles",
         type=int,

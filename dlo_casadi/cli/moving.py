@@ -78,8 +78,11 @@ def modes(chosen: argparse.Namespace) -> None:
     dlo modes results/cable --end 0.3 -0.1
     dlo modes results/cable --start-heading -1.2 --damping damping_time=0.02 --figure modes.png
     """
+    from dlo_casadi.cable.shape_in_motion import svg_file
     from dlo_casadi.show.style import save_figure
 
+    if chosen.animate is not None:
+        svg_file(chosen.animate)  # before anything is computed
     asked = {name: getattr(chosen, name) for name in HELD}
     shape = damped(chosen).solve(**asked, clips=listed(chosen, "clips"))
     found, page = shape.modes(chosen.count), Page(chosen)
@@ -117,9 +120,12 @@ def simulate(chosen: argparse.Namespace) -> None:
     dlo simulate results/rope ends.csv --animate
     dlo simulate results/rope ends.csv --damping damping_time=0.02 --output motion.csv
     """
+    from dlo_casadi.cable.simulated import gif_file
     from dlo_casadi.io.files import write_file
     from dlo_casadi.show.style import save_figure
 
+    if chosen.animate is not None:
+        gif_file(chosen.animate)  # before anything is computed
     cable = damped(chosen)
     t, rows = read_fixtures(cable.model.node, chosen.fixtures)
     motion, page = cable.simulate(t, **rows, clips=listed(chosen, "clips")), Page(chosen)
@@ -137,21 +143,17 @@ def simulate(chosen: argparse.Namespace) -> None:
         lines = (",".join(f"{x:.6g}" for x in row) for row in table.tolist())
         write_file(chosen.output, "\n".join([header, *lines, ""]))
         written.append(f"Markers: {chosen.output}")
-    forces = {side: getattr(motion, f"{side}_force") for side in ("start", "end")}
-    every = {**{f"its {side}": force for side, force in forces.items()}, **motion.clip_forces}
-    largest = {where: float(np.linalg.norm(f, axis=1).max()) for where, f in every.items()}
     page.data(
         {
             "t": t.tolist(),
             "points": motion.points.tolist(),
-            **{f"{side}_force": force.tolist() for side, force in forces.items()},
+            "start_force": motion.start_force.tolist(),
+            "end_force": motion.end_force.tolist(),
             "clip_forces": {name: force.tolist() for name, force in motion.clip_forces.items()},
             "energy": motion.energy.tolist(),
         }
     )
-    page.say(f"{cable.name}: {t[0]:g} to {t[-1]:g} s in {len(motion.way.t) - 1} steps")
-    for where, size in largest.items():
-        page.say(f"  largest force on {where}: {size:.4g} N")
+    page.say(motion)
     for line in written:
         page.say(line)
 
@@ -186,6 +188,7 @@ def move(chosen: argparse.Namespace) -> None:
     dlo move results/rope --from end=0.3,0 --to end=0.4,0.1 --limits speed=0.5 force=2
     """
     from dlo_casadi.cable.move_checks import table_file
+    from dlo_casadi.cable.simulated import gif_file
     from dlo_casadi.errors import DloError
     from dlo_casadi.show.style import save_figure
 
@@ -193,6 +196,8 @@ def move(chosen: argparse.Namespace) -> None:
         raise DloError(f"--rate {chosen.rate:g}: 1 to 10000 rows a second")
     if chosen.output is not None:
         table_file(chosen.output)  # before anything is planned
+    if chosen.animate is not None:
+        gif_file(chosen.animate)
     with Watch(quiet=chosen.quiet) as watch:
         found = damped(chosen).move(
             _held(chosen.before),

@@ -37,7 +37,7 @@ from dlo_casadi.rod.supports import CLIPS
         "--clips",
         nargs="+",
         default=(),
-        choices=CLIPS,
+        choices=[str(kind) for kind in CLIPS],
         help="what holds it between its ends, in the order along the cable",
     ),
     json="print what was written as JSON",

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray, IntArray
-from dlo_casadi.errors import MeasurementError
+from dlo_casadi.errors import MeasurementError, counted
 from dlo_casadi.io.points import COLUMNS, PLACE, TIME
 from dlo_casadi.io.tables import Table, read_table
 
@@ -154,7 +154,9 @@ def motion_points(
     _check_times(t, where)
     times, instant = np.unique(t, return_inverse=True)
     if len(times) < _LEAST:
-        raise MeasurementError(f"holds {len(times)} instants; a motion takes {_LEAST} or more")
+        raise MeasurementError(
+            f"holds {counted(len(times), 'instant')}; a motion takes {_LEAST} or more"
+        )
     if s is None:
         first = np.searchsorted(instant, np.arange(len(times)))
         column, places = np.arange(len(t)) - first[instant], None

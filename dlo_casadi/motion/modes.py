@@ -72,8 +72,9 @@ def lowest(matrices: Matrices, count: int, scale: float) -> tuple[FloatArray, Fl
     shift = -0.1 * scale
     factor = Banded(matrices.stiffness - shift * matrices.mass, matrices.width)
     stiffness, mass = (matrices.sparse(x) for x in (matrices.stiffness, matrices.mass))
-    width = count + max(count, _GUARDS)
-    q: FloatArray = np.random.default_rng(0).normal(size=(mass.shape[0], width))
+    size = mass.shape[0]
+    width = min(count + max(count, _GUARDS), size)
+    q: FloatArray = np.random.default_rng(0).normal(size=(size, width))
     before = np.full(count, np.inf)
     for _ in range(_ITERATIONS):
         q = factor.solve(mass @ q)

@@ -230,7 +230,11 @@ def started(
     `now`, `later`: the fixtures before and after that step. Velocities that contradict those of the
     fixtures jump as in an impact.
     """
-    soon = replace(now, places=now.places + _INSTANT * now.velocities)
+    # From where the cable is: a place that is off by rounding is no velocity.
+    places = now.places.copy()
+    for k, node in cable.held:
+        places[k] = state.r[node]
+    soon = replace(now, places=places + _INSTANT * now.velocities)
     first = Stepper(cable, FIRST)
     after = first.step(still(state), soon, _INSTANT)
     if after is None:

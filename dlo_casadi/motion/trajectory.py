@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -176,7 +177,7 @@ def way_of(
     h = dt or _FIRST * (until - now)
     first = path.at(now, cable)
     while (begun := started(cable, state, first, path.at(now + h, cable), h)) is None:
-        h = _halved(h, now, t, cable)
+        h = _halved(h, now, t, cable, path)
     moving, times, states, before = begun, [now], [begun.state], h
     while now < until * (1 - 1e-12):
         # The last two steps share what is left, so that none is tiny.
@@ -184,7 +185,7 @@ def way_of(
         h = left if h > left * (1 - 1e-9) else min(h, max(left / 2, left - h))
         after = stepper.step(moving.for_step(h / before), path.at(now + h, cable), h)
         if after is None:
-            h = _halved(h, now, t, cable)
+            h = _halved(h, now, t, cable, path)
             continue
         factor = 1.0 if dt else _factor(_error(stepper, moving, after, h), tolerance)
         if factor < _REPEATED and h > _SHORTEST * (until - t[0]):
@@ -211,13 +212,36 @@ def _factor(error: float, tolerance: float) -> float:
     return 1.0 if low < found < high else min(max(found, _LEAST), _MOST)
 
 
-def _halved(dt: float, now: float, t: tuple[float, float], cable: MovingCable) -> float:
+def _halved(
+    dt: float, now: float, t: tuple[float, float], cable: MovingCable, path: FixturePath
+) -> float:
     """Half a step, unless that is too short."""
     if dt > _SHORTEST * (t[1] - t[0]):
         return dt / 2
+    fixtures = path.at(now, cable)
+    fastest = np.linalg.norm(fixtures.velocities, axis=1)[[k for k, _ in cable.held]].max()
     raise MotionError(
         f"{cable.model.cable.name!r} at {now:.6g} s: no step in time has a solution, down to "
-        f"{dt:.2g} s.\n  Try: fixtures that stay within the cable's reach, and that do not jump; "
-        f"with large forces more elements (n = {cable.model.n}).",
+        f"{dt:.2g} s. {_tightest(cable, fixtures, path)}Fixtures move at up to {fastest:.3g} m/s."
+        "\n  Try: fixtures that stay within the cable's reach, and that jump neither in place nor "
+        f"in direction or speed; with large forces more elements (n = {cable.model.n}).",
         t=now,
+    )
+
+
+def _tightest(cable: MovingCable, fixtures: Fixtures, path: FixturePath) -> str:
+    """A sentence about the span with the least cable beyond its chord; empty without spans."""
+    names = ("start", "end", *(clip.name for clip in path.pose.clips))
+    held = sorted(cable.held, key=lambda pair: pair[1])
+    spans = []
+    for (first, low), (last, high) in pairwise(held):
+        chord = float(np.linalg.norm(fixtures.places[last] - fixtures.places[first]))
+        length = float(cable.along[high] - cable.along[low])
+        spans.append((chord / length, names[first], names[last], chord, length))
+    if not spans:
+        return ""
+    _, first_name, last_name, chord, length = max(spans)
+    return (
+        f"Its {first_name} and {last_name} are {chord:.4g} m apart, with {length:.4g} m of cable "
+        "between them. "
     )

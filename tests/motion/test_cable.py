@@ -71,6 +71,8 @@ def test_modes_have_their_damping(cable):
         ({"t": [0.0, 1.0], "start": np.zeros((3, 2))}, "each of 2 times"),
         ({"t": [0.0, 1.0], "start_heading": np.nan}, "finite"),
         ({"t": [0.0, 1.0], "end": (0.1, 0.1)}, "free"),
+        ({"t": [0.0, 1.0], "tolerance": -1}, "tolerance: a number above zero"),
+        ({"t": [0.0, 1.0], "tolerance": "small"}, "tolerance: a number above zero"),
     ],
 )
 def test_wrong_arguments_are_named(cable, asked, message):
@@ -78,9 +80,73 @@ def test_wrong_arguments_are_named(cable, asked, message):
         cable.simulate(**{"start_heading": -1.2, **asked})
 
 
+def test_an_end_that_slides_does_not_move():
+    data = dlo.Cable(length=0.6, mass=0.06, diameter=0.008, bending_stiffness=0.009)
+    cable = dlo.known_cable(data, gravity=(0, -9.81), boundary=("clamped", "slide"))
+    with pytest.raises(dlo.DloError, match="an end that slides: a cable in motion is not fed"):
+        cable.simulate(T, start_heading=0.0, end=(0.5, 0.0), end_heading=0.0)
+
+
 def test_unknown_damping_is_named(cable):
     with pytest.raises(dlo.DloError, match="viscous_drag"):
         cable.with_damping(water=1.0)
+    with pytest.raises(dlo.DloError, match="damping_time: a number belongs here, found 'x'"):
+        cable.with_damping("x")
+    for again in ({"damping_time": 0.03}, {"air_drag": 1.2}):
+        with pytest.raises(dlo.DloError, match="has it already"):
+            cable.with_damping(**again)
+
+
+def test_more_modes_than_a_mesh_has_are_refused(cable):
+    with pytest.raises(dlo.DloError, match=r"9999 modes: this mesh has \d+"):
+        cable.solve(start_heading=-1.2).modes(9999)
+
+
+def test_steps_take_any_number_and_shapes_alone(cable):
+    assert cable.step(np.float32(0.01)).name_out(0) == "next"
+    with pytest.raises(dlo.DloError, match="about: a shape"):
+        cable.step(0.01, about="rest")
+
+
+def test_a_motion_is_told_in_a_few_lines_and_ends_where_the_cable_does(cable):
+    motion = cable.simulate(T[:2], start_heading=-1.2)
+    assert repr(motion).startswith("cable: 0 to 0.05 s in ")
+    assert "largest force on its start: 0.5886 N" in repr(motion)
+    assert len(repr(motion).splitlines()) == 3
+    assert motion.at(0.6)[:, 0] == pytest.approx(motion.points[:, -1])
+    for wrong in (0.7, [-0.01], np.nan, "tip", [[0.1]]):
+        with pytest.raises(dlo.DloError, match=r"s: arc lengths of 0 to 0\.6 m"):
+            motion.at(wrong)
+
+
+@pytest.mark.parametrize("ends", [("clamped", "free"), ("pinned", "pinned")])
+def test_a_place_that_is_off_by_rounding_begins_a_motion(ends):
+    """Nothing moves: forces stay those at rest, whatever shape or motion begins."""
+    data = dlo.Cable(length=0.6, mass=0.06, diameter=0.008, bending_stiffness=0.009)
+    cable = dlo.known_cable(data, gravity=(0, -9.81), boundary=ends, model={"n": 10})
+    cable = cable.with_damping(0.02)
+    held = {"start_heading": -1.2} if ends[1] == "free" else {"end": (0.4, 0.1)}
+    shape = cable.solve(**held)
+    off = 1e-3 if ends[1] == "free" else 1e-7
+    for begins in (shape, cable.simulate(T[:2], **held)):
+        motion = cable.simulate(T[:3], start=(off, 0.0), **held, begins=begins)
+        assert motion.points[-1] == pytest.approx(shape.points + np.array([off, 0]), abs=1e-6)
+        if "start_heading" in held:
+            cable.simulate(T[:2], start_heading=-1.19, begins=begins)
+            continue
+        with pytest.raises(dlo.DloError, match=r"0.001 mm off its fixtures.\n  Try: start=\(0.0, "):
+            cable.simulate(T[:2], start=(1e-6, 0.0), **held, begins=begins)
+
+
+def test_a_cable_that_is_torn_tells_how_far_its_ends_are_apart():
+    data = dlo.Cable(length=0.6, mass=0.06, diameter=0.008, bending_stiffness=0.009)
+    ends = ("pinned", "pinned")
+    cable = dlo.known_cable(data, gravity=(0, -9.81), boundary=ends, model={"n": 8})
+    end = np.stack([0.5 + 2 * T[:3], 0 * T[:3]], axis=1)
+    with pytest.raises(
+        dlo.DloError, match=r"start and end are 0\.\d+ m apart, with 0.6 m of cable"
+    ):
+        cable.simulate(T[:3], end=end)
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

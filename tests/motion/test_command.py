@@ -45,6 +45,14 @@ def test_a_simulation_is_written(folder, capsys):
     assert table.read_text().startswith("t_s,s_m,x_m,y_m\n0,0,0,0\n")
 
 
+def test_names_of_pictures_are_checked_first(folder, capsys):
+    """Before the table of fixtures is read, or a shape is solved."""
+    assert main(["simulate", str(folder), "nowhere.csv", "--animate", "a.mp4"]) == 2
+    assert "a.mp4: moving pictures are GIF" in capsys.readouterr().err
+    assert main(["modes", str(folder), "--end", "1", "1", "--animate", "a.gif"]) == 2
+    assert "Try: a.svg" in capsys.readouterr().err
+
+
 def test_unknown_columns_are_named(folder, capsys):
     (folder / "wrong.csv").write_text("t_s,start_z_m\n0,1\n1,1\n")
     assert main(["simulate", str(folder), str(folder / "wrong.csv")]) == 2
