@@ -39,11 +39,13 @@ def orange(tmp_path_factory):
     return folder / "orange.yaml"
 
 
-def test_the_installed_command_helps_without_the_numerical_libraries():
+@pytest.mark.parametrize(
+    "command", [[Path(sys.executable).with_name("dlo")], [sys.executable, "-m", "dlo_casadi"]]
+)
+def test_the_installed_command_helps_without_the_numerical_libraries(command):
     """They alone take 1 to 3 s to import."""
-    command = [Path(sys.executable).with_name("dlo"), "--help"]
     told = {**os.environ, "PYTHONPROFILEIMPORTTIME": "1"}
-    done = subprocess.run(command, capture_output=True, text=True, env=told)
+    done = subprocess.run([*command, "--help"], capture_output=True, text=True, env=told)
     assert done.returncode == 0
     imported = {line.split("|")[-1].strip() for line in done.stderr.splitlines()}
     assert "dlo_casadi.cli" in imported

@@ -391,6 +391,11 @@ def test_a_known_load_may_be_many_times_the_weight(tmp_path, load):
         (3, {}, "cable: a mapping of keys and values belongs here, found 3. Try: dlo.Cable(...)"),
         (ROPE, {"model": {"effects": ["lumped_mas"]}}, "did you mean 'lumped_mass'?"),
         (ROPE, {"model": effect("lumped_mass", mass=0.1)}, "lumped_mass needs position [m]: no"),
+        (
+            ROPE,
+            {"model": {"effects": [{"name": "lumped_mass", "mass": 0.1}]}},
+            "unknown key 'mass' in model.effects[0]; it belongs into parameters: {mass: ...}",
+        ),
         (ROPE, {"model": {"effects": ["plastic_set"]}}, "Try: rest_curvature as it is now"),
         (
             ROPE,

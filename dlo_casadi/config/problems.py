@@ -4,7 +4,7 @@ import difflib
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar, get_args
+from typing import Any, NamedTuple, TypeVar, get_args, get_origin
 
 from pydantic import TypeAdapter, ValidationError
 from pydantic.dataclasses import is_pydantic_dataclass
@@ -65,6 +65,11 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 def keys_of(section: type) -> dict[str, FieldInfo]:
     """The keys of a section, with what pydantic knows of each."""
     return section.__pydantic_fields__  # type: ignore[attr-defined]
+
+
+def _is_mapping(field: FieldInfo) -> bool:
+    """Whether a key has a mapping of names that no section knows."""
+    return get_origin(field.annotation) is dict
 
 
 # Maps the path of keys in a file, with the kinds chosen in it, to the class of the section there
@@ -282,6 +287,9 @@ def explain(model: type, errors: Sequence[ErrorDetails], source: Source) -> Iter
                 if str(key) in keys_of(inner)
             ]
             homes = [home for home in homes if home]
+            # Names of the user's own, such as parameters of an effect, belong into a mapping.
+            of_names = [name for name, field in keys_of(section).items() if _is_mapping(field)]
+            homes = [f"{name}: {{{key}: ...}}" for name in of_names] or homes
             if homes and "did you mean" not in hint:
                 hint = f"; it belongs into {' or '.join(homes)}"
             text = f"unknown key {show(str(key))} in {source.label(place[:-1])}{hint}"
