@@ -42,6 +42,8 @@ from dlo_casadi.sensing.sensors import Markers
 ASIDE, ASIDE_HELD = 0.25, 0.05
 # Duration [s] and rate [1/s] of the recording; points along the cable where lines were measured.
 DURATION, RATE, POINTS = 3.0, 100.0, 10
+# Share of the slowest rate of a cable below which nothing holds a mode.
+FREE = 0.05
 # Modes that are compared, and poses that are tried at most.
 MODES, TRIED = 3, 12
 
@@ -140,7 +142,11 @@ def _modes_of(fit: Fit, pose: HeldPose) -> ModesAtRest:
     nominal = dict(zip(model.names, model.nominal.tolist(), strict=True))
     p = np.array([known.get(name, nominal[name]) for name in model.names])
     found = solve_equilibrium(model, p, fit.rest_now, pose)
-    return ModesAtRest(model, p, fit.rest_now, found, pose, MODES)
+    modes = ModesAtRest(model, p, fit.rest_now, found, pose, MODES)
+    cable, _, own = modes.state()
+    if own.rates.min() < FREE * cable.slowest:
+        raise DloError("a mode that nothing holds, such as a roll about ball joints, has no rate")
+    return modes
 
 
 def _gap(own: ModesAtRest, rival: ModesAtRest) -> FloatArray:

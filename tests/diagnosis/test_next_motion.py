@@ -82,6 +82,20 @@ def test_what_swings_alike_is_not_apart(measured: list[MeasuredPose]) -> None:
     assert told.rivals["itself"].separation == pytest.approx(0.0, abs=1e-6)
 
 
+def test_a_cable_that_nothing_keeps_from_rolling_has_no_rates_to_compare() -> None:
+    """Between ball joints in space."""
+    cable = CableData(LENGTH, 0.08, 0.008, 0.012, straight=True, torsional_stiffness=0.01)
+    model = CableModel(cable, 8, start="pinned", end="pinned", n_rest=0, gravity=(0, 0, -9.81))
+    poses = [HeldPose((0.0, 0.0, 0.0), (x, 0.1, 0.0), name=f"{x:g}") for x in (0.4, 0.5)]
+    shapes = predict_poses(model, model.nominal, np.zeros(model.chain.n_rests), poses)
+    s = np.linspace(0.1, 0.9, 8) * LENGTH
+    measured = [
+        MeasuredPose.of_points(x, y.curve.at(s), s=s) for x, y in zip(poses, shapes, strict=True)
+    ]
+    fit = fit_model(model, measured, Tolerances(), STD, refined=False)
+    assert next_motion(fit, {"itself": fit}) is None
+
+
 def test_recordings_know_no_effect_of_the_camera(measured: list[MeasuredPose]) -> None:
     plain = fit_model(MODEL, measured, Tolerances(), STD)
     scaled = fit_model(MODEL.with_effect(ImageScale()), measured, Tolerances(), STD)
