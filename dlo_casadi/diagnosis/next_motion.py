@@ -22,6 +22,7 @@ Rife and Boorstyn, IEEE Trans. Inf. Theory 20 (1974); Yao and Pandit, IEEE Trans
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -116,16 +117,17 @@ def next_motion(fit: Fit, others: Mapping[str, Fit], of: str = "") -> NextMotion
         return None
     picked = np.unique(np.linspace(0, len(poses) - 1, TRIED).round().astype(int))
     tried = []
-    try:
-        for pose in (poses[k] for k in picked):
+    for pose in (poses[k] for k in picked):
+        with suppress(DloError):
             own = _modes_of(fit, pose)
             each = {name: _modes_of(one, pose) for name, one in rivals.items()}
             gaps = [np.abs(_gap(own, one)).max() for one in each.values()]
             tried.append((min(gaps), own, each))
-        _, own, each = max(tried, key=lambda x: x[0])
-        return _compared(fit, rivals, own, each, of)
-    except DloError:
-        return None
+    # A cable may lose its shape within what is known of its parameters.
+    for _, own, each in sorted(tried, key=lambda x: -x[0]):
+        with suppress(DloError):
+            return _compared(fit, rivals, own, each, of)
+    return None
 
 
 def _seen_otherwise(fit: Fit, other: Fit) -> bool:
