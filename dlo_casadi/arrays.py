@@ -55,7 +55,8 @@ def cross(a: FloatArray, b: FloatArray) -> FloatArray:
 
 def unit(vectors: FloatArray) -> NDArray[np.float64]:
     """Vectors (..., d) divided by their lengths; zero vectors stay zero."""
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300)
+    squares = (vectors * vectors).sum(axis=-1, keepdims=True)
+    return np.asarray(vectors / np.maximum(np.sqrt(squares), 1e-300))
 
 
 def chord_lengths(points: FloatArray) -> NDArray[np.float64]:

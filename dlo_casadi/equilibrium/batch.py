@@ -394,13 +394,13 @@ class BatchEquilibrium:
     ) -> list[tuple[Observed, ObservedChange]]:
         """Predicted measurements of each pose, and their derivatives along directions."""
         here = self.at(shapes, p, rest)
-        _, moved = here.curve_along(along)
+        rows, moved = here.curve_along(along)
         felt: FloatArray = np.zeros((self.m, 0))
         changes: FloatArray = np.zeros((self.m, 0, along.x.shape[3]))
         if self.wrenches:
             felt, changes = here.readings(), here.readings_along(along)
         knots = here.knots_along(along) if self.model.moves_nodes else repeat(None)
-        each = zip(curves_of(here), felt, moved, changes, knots, strict=False)
+        each = zip(curves_of(here, rows), felt, moved, changes, knots, strict=False)
         return [
             (Observed(curve, readings), ObservedChange(*change))
             for curve, readings, *change in each

@@ -289,8 +289,9 @@ class ObservedChange:
     knots: FloatArray | None = None
 
 
-def curves_of(found: Assembly) -> list[NodeCurve]:
-    """Measured curves of m shapes."""
+def curves_of(found: Assembly, rows: FloatArray | None = None) -> list[NodeCurve]:
+    """Measured curves of m shapes; `rows`: their `Assembly.curve` if it is known."""
     length = found.model.cable.length
     knots = found.clipped.places if found.model.moves_nodes else repeat(None)
-    return [NodeCurve.of(length, z, own) for z, own in zip(found.curve(), knots, strict=False)]
+    rows = found.curve() if rows is None else rows
+    return [NodeCurve.of(length, z, own) for z, own in zip(rows, knots, strict=False)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -88,7 +89,7 @@ class HeldPose:
         known = {name: list(x) if isinstance(x, tuple) else x for name, x in known.items()}
         return {**known, "turns": self.turns} if self.node.twists else known
 
-    @property
+    @cached_property
     def ends(self) -> FloatArray:
         """Start, end [m], start frame, end frame: see `EndConditions.vector`."""
         end = self.end if self.end is not None else (0.0,) * len(self.start)
@@ -99,7 +100,7 @@ class HeldPose:
         """Distance [m] of the end from the start; 0 for a free end."""
         return 0.0 if self.end is None else math.dist(self.start, self.end)
 
-    @property
+    @cached_property
     def frames(self) -> tuple[FloatArray, FloatArray]:
         """Frames (coordinates,) of both ends as nodes carry them: in a plane headings [rad]."""
         known = (getattr(self, name) or self.node.identity for name in self._direction_names)

@@ -90,12 +90,17 @@ class Assembly(Evaluation):
         total = value[:, :, 0, 0].sum(axis=1) + end_value[:, 0, 0]
         matrix = self._held(self._band(bend, end_bend))
         force = self._added(gradient, end_gradient)
-        self.clipped.hold(force, self._stiffness * self.clipped.gaps(self.shapes.x))
+        self._hold(force)
         if self.touching:
             total, force = self.touching.added(total, force, gradient)
             matrix = self.touching.matrix(matrix, bend)
         self.clipped.hold_matrix(matrix, self._stiffness.ravel())
         return total, force, matrix
+
+    def _hold(self, force: Vector) -> None:
+        """Hold nodes at clamped clips in the clips' frames."""
+        if self.clipped.clamps:
+            self.clipped.hold(force, self._stiffness * self.clipped.gaps(self.shapes.x))
 
     @property
     def _stiffness(self) -> FloatArray:
@@ -133,7 +138,7 @@ class Assembly(Evaluation):
     def imbalance(self) -> Vector:
         """Gradient of the Lagrangian by increments and multipliers, without its Hessian."""
         gradient, force = self._slope()
-        self.clipped.hold(force, self._stiffness * self.clipped.gaps(self.shapes.x))
+        self._hold(force)
         if self.touching:
             _, force = self.touching.added(np.zeros(()), force, gradient)
         return force
@@ -208,10 +213,10 @@ class Assembly(Evaluation):
         self, blocks: FloatArray, along: Tangents, total: FloatArray | float = 0.0
     ) -> FloatArray:
         """Add the change along p, rest and deviation to a total, given segments' derivatives."""
-        rest = self.clipped.rest_inside(along.rest)
-        n_p, n_r = along.p.shape[1], along.p.shape[1] + rest.shape[2]
+        n_p, n_r = along.p.shape[1], blocks.shape[-1] - along.deviation.shape[1]
         total = total + blocks[..., :n_p] @ along.p[:, None]
-        total += blocks[..., n_p:n_r] @ rest
+        if along.rest.any():
+            total += blocks[..., n_p:n_r] @ self.clipped.rest_inside(along.rest)
         total += blocks[..., n_r:] @ along.deviation[:, None]
         return np.asarray(total)
 
@@ -233,6 +238,8 @@ class Assembly(Evaluation):
         self, p: FloatArray, deviation: FloatArray | None = None, lam: FloatArray | None = None
     ) -> FloatArray:
         """Change (m, k + 2, q) [m] of the supports' arc lengths along directions of these."""
+        if not self.model.moves_nodes:
+            return np.zeros((len(p), 2, p.shape[2]))
         slips = functions_of(self.model).clip_slopes[0] @ p
         rate = np.pad(slips, [(0, 0), (1, 1), (0, 0)])
         if deviation is not None and self.model.slides and self.model.fed_by_length:
@@ -247,6 +254,8 @@ class Assembly(Evaluation):
 
     def _by_turns(self, p: FloatArray) -> FloatArray:
         """Rotations (m, n_nodes, increment, q) of the nodes that clips hold, likewise."""
+        if not self.model.clips:
+            return NONE
         turns = functions_of(self.model).clip_slopes[1]
         return self.clipped.turned(np.einsum("kpb,mpq->mkbq", turns, p))
 

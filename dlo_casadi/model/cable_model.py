@@ -136,7 +136,7 @@ class CableModel:
         """Whether the cable may leave the plane."""
         return len(self.gravity) == 3
 
-    @property
+    @cached_property
     def node(self) -> type[Node]:
         """The kind of its nodes."""
         return NODES[len(self.gravity)]
@@ -161,7 +161,7 @@ class CableModel:
         """Size of the clips' part of `HeldPose.vector`."""
         return len(self.clips) * clip_size(self.node)
 
-    @property
+    @cached_property
     def deviation_names(self) -> tuple[str, ...]:
         """Names of the unknowns that each pose has of its own."""
         random = (f"{x.label}.{q.name}" for x in self.random for q in x.parameters(self.cable))
@@ -217,7 +217,7 @@ class CableModel:
         """Qualified names of the parameters, in the order of the vector `p`."""
         return tuple(parameter.name for parameter in self.parameters)
 
-    @property
+    @cached_property
     def stiffness_indices(self) -> list[int]:
         """Indices of the stiffnesses in the vector `p`, bending first."""
         return [k for k, name in enumerate(self.names) if name in STIFFNESSES]
@@ -270,7 +270,7 @@ class CableModel:
         """Whether a pose changes the rest curvature of the next one."""
         return any(isinstance(effect, StateEffect) for effect in self.effects)
 
-    @property
+    @cached_property
     def may_spin(self) -> bool:
         """Whether only a rest curvature determines the roll of the cable about its own axis."""
         held = any(kind.roll for kind in (self.start, self.end, *self.clips))
@@ -291,7 +291,7 @@ class CableModel:
         """Number of springs at places of the cable."""
         return sum(effect.n_springs for effect in self.effects if isinstance(effect, Load))
 
-    @property
+    @cached_property
     def n_border(self) -> int:
         """Number of unknowns of the whole pose: `border_names`."""
         return len(self.border_names)
@@ -307,12 +307,12 @@ class CableModel:
         """Number of places at which the cable may touch obstacles, see `contact`."""
         return len(self.surfaces) * (self.n - self.end.place)
 
-    @property
+    @cached_property
     def n_lam(self) -> int:
         """Number of border unknowns on which segments depend: all except contact forces."""
         return self.n_border - self.n_contacts
 
-    @property
+    @cached_property
     def end_pull(self) -> list[int]:
         """Rows of the border (dimension,) of a force at the end of the cable, if there are any.
 
@@ -383,17 +383,17 @@ class CableModel:
         known = self.border_names
         return {k: known.index(name) for k, name in rows.items() if name in known}
 
-    @property
+    @cached_property
     def loose(self) -> tuple[bool, bool]:
         """Whether the cable slides through its start, and through its end."""
         return self.start.slides, self.end.slides
 
-    @property
+    @cached_property
     def slides(self) -> bool:
         """Whether the cable slides through an end."""
         return any(self.loose)
 
-    @property
+    @cached_property
     def moves_nodes(self) -> bool:
         """Whether nodes stand at arc lengths of their own: at clips and ends that slide."""
         return bool(self.clips) or self.slides
@@ -403,7 +403,7 @@ class CableModel:
         """Whether a clip between the ends holds the direction of the cable."""
         return any(kind.direction for kind in self.clips)
 
-    @property
+    @cached_property
     def n_multipliers(self) -> int:
         """Number of multipliers in the border: negative eigenvalues of a minimum's Hessian."""
         return int(self.are_multipliers.sum())

@@ -125,8 +125,11 @@ class Chain:
     def rest_inside(self, means: FloatArray) -> FloatArray:
         """Rest strains inside (..., n_segments, 3 strains, q), from means (..., n_rests, q)."""
         cells, weights = self.rest_stencils
-        by_strain = [weights @ part[..., cells, :] for part in self.by_strain(means)]
-        return np.concatenate(by_strain, axis=-2)
+        *rows, size, q = means.shape
+        strains = size // self.n_cells
+        by_strain = means.reshape((*rows, strains, self.n_cells, q))
+        inside = np.moveaxis(weights @ by_strain[..., cells, :], -4, -3)
+        return inside.reshape((*rows, self.n_segments, 3 * strains, q))
 
     def by_strain(self, means: FloatArray) -> list[FloatArray]:
         """Means (..., n_rests, q) split into parts (..., n_cells, q), one for each strain."""

@@ -278,7 +278,7 @@ class Frame(Node):
         if isinstance(x, _CASADI):
             return _frame_moved(x, delta)
         turned = quaternion_product(components(x), (*components(delta / 2), 1.0))
-        return unit(np.stack(np.broadcast_arrays(*turned), axis=-1))
+        return unit(np.stack(turned, axis=-1))
 
     @staticmethod
     def excess(x: Any) -> Any:

@@ -39,7 +39,7 @@ def traced(function: Callable[..., ca.SX]) -> Callable[..., ca.SX]:
 
 def components(x: FloatArray) -> FloatArray:
     """Components of vectors, which are the last axis of an array."""
-    return np.moveaxis(x, -1, 0)
+    return x.transpose(x.ndim - 1, *range(x.ndim - 1))
 
 
 def quaternion_product(p: Any, q: Any) -> tuple[Any, Any, Any, Any]:

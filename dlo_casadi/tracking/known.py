@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Self
 
 import numpy as np
@@ -13,6 +13,7 @@ from dlo_casadi.arrays import BoolArray, FloatArray
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.spread import Uncertainty
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.functions import MODELS
 
 # Largest change of a logarithm in an update.
 _LOGS = 3.0
@@ -45,10 +46,9 @@ class Known:
 
     def moved(self, by_p: FloatArray, by_rest: FloatArray) -> Self:
         """The cable with other values, within their bounds; logarithms change by a share."""
-        bounds = np.array([q.bounds(estimated=True) for q in self.model.parameters])
         rise = np.exp(np.clip(self.rises(by_p, self.p), -_LOGS, _LOGS))
         new = np.where(self._logs, self.p * rise, self.p + by_p)
-        p = np.where(by_p == 0, self.p, np.clip(new, bounds[:, 0], bounds[:, 1]))
+        p = np.where(by_p == 0, self.p, np.clip(new, *_bounds(self.model)))
         return replace(self, p=p, rest=self.rest + by_rest)
 
     def at(self, ways: Sequence[FloatArray], step: FloatArray) -> Self:
@@ -59,14 +59,13 @@ class Known:
         by_p, by_rest = (way[:, : len(step)] for way in ways[:2])
         return self.moved(by_p @ (self.scale * step), by_rest @ step)
 
-    @property
+    @cached_property
     def scale(self) -> FloatArray:
         """Derivatives (n,) of the values by the unknowns: stiffnesses, for their logarithms."""
-        logs = {q.name for q in self.model.parameters if q.log}
-        values = dict(zip(self.model.names, self.p, strict=True))
-        return np.array([values[x] if x in logs else 1.0 for x in self.uncertainty.names])
+        values = dict(zip(self.model.names, np.where(self._logs, self.p, 1.0), strict=True))
+        return np.array([values.get(x, 1.0) for x in self.uncertainty.names])
 
-    @property
+    @cached_property
     def root(self) -> FloatArray:
         """A (n, n) with A A^T the covariance of the unknowns, of stiffnesses of logarithms."""
         return np.asarray(self.uncertainty.root / self.scale[:, None])
@@ -144,11 +143,16 @@ class Known:
         for name, value in values.items():
             if name not in model.names:
                 rest += model.rest_basis[:, coefficient(name)] * value
-        bounds = np.array([q.bounds(estimated=True) for q in model.parameters])
         free = np.array([name in std for name in model.names])
-        p = np.where(free, np.clip(p, bounds[:, 0], bounds[:, 1]), p)
+        p = np.where(free, np.clip(p, *_bounds(model)), p)
         uncertainty = replace(old, names=names, covariance=covariance)
         return replace(self, model=model, p=p, rest=rest, uncertainty=uncertainty)
+
+
+@lru_cache(maxsize=MODELS)
+def _bounds(model: CableModel) -> FloatArray:
+    """Bounds (2, n_parameters) of parameters that are estimated."""
+    return np.array([q.bounds(estimated=True) for q in model.parameters]).T
 
 
 def coefficient(name: str) -> int:

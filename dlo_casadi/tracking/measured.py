@@ -150,5 +150,7 @@ class Measured:
     def alike(self, seen: Observed, std: float) -> FloatArray:
         """Derivatives (R, d) by shifts of all points alike, of this standard deviation [m]."""
         d = self.points.shape[1]
+        if not std:
+            return np.zeros((self.size, 0))
         shift = np.broadcast_to(std * np.eye(d), (len(self.points), d, d))
         return np.vstack([self._rows(seen, shift), np.zeros((len(self.rows), d))])

@@ -18,7 +18,7 @@ Bell and Cathey, IEEE Trans. Autom. Control 38 (1993).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -69,18 +69,28 @@ class Told:
     turns: FloatArray
     shapes: Shapes
 
-    def error(self, step: FloatArray) -> float:
-        """Second-order change of what is predicted, in units of the noise, roughly.
+    @cached_property
+    def information(self) -> FloatArray:
+        """G^T G (n, n)."""
+        return self.columns.T @ self.columns
 
-        It is the first-order one times how far nodes turn or stiffnesses change.
-        """
-        rise = np.abs(step[self.at.are_logs]).max(initial=0.0)
-        share = max(rise, np.abs(self.turns @ step).max())
-        return float(share * np.linalg.norm(self.columns @ step)) / 2
+    @cached_property
+    def slope(self) -> FloatArray:
+        """G^T (e + G theta_0) (n,)."""
+        return self.columns.T @ self.residual + self.information @ self.at.unknowns
 
-    def strays(self, now: Known) -> bool:
-        """Whether a cable is too far from where this was linearised."""
-        return self.error(now.unknowns - self.at.unknowns) > _LINEAR
+
+def errors(told: Sequence[Told], steps: FloatArray) -> FloatArray:
+    """Second-order change of what each pose predicts, in units of the noise, roughly.
+
+    It is the first-order one times how far nodes turn or stiffnesses change by the steps (m, n).
+    """
+    columns = np.array([one.information for one in told])
+    turns = np.array([one.turns for one in told])
+    felt = np.maximum(np.einsum("mi,mij,mj->m", steps, columns, steps), 0.0)
+    rise = np.abs(steps * told[0].at.are_logs).max(axis=1)
+    turned = np.abs(turns @ steps[..., None]).max(axis=(1, 2))
+    return np.asarray(np.maximum(rise, turned) * np.sqrt(felt) / 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +203,10 @@ def _learned(
         information = np.eye(len(z)) + columns.T @ columns
         before, z = z, np.linalg.solve(information, columns.T @ (told.residual + columns @ z))
         step = z - before
-        if step @ information @ step < _SMALL**2 or told.error(root @ step) < _LINEAR:
+        if (
+            step @ information @ step < _SMALL**2
+            or errors([told], (root @ step)[None])[0] < _LINEAR
+        ):
             break
         start = linear.ahead(batch, root @ step)
     else:
@@ -204,15 +217,13 @@ def _learned(
     return after.with_root(root @ left), replace(seen, told=told, iterations=iterations)
 
 
-def joined(base: Known, poses: Iterable[Seen], shaper: Shaper) -> Known:
+def joined(base: Known, poses: Sequence[Seen], shaper: Shaper) -> Known:
     """The cable after poses, from what was known before them and what each of them told."""
     root = base.root
-    information, slope = np.eye(root.shape[1]), np.zeros(root.shape[1])
-    for told in (one.told for one in poses):
-        columns = told.columns @ root
-        information += columns.T @ columns
-        slope += columns.T @ (told.residual + told.columns @ (told.at.unknowns - base.unknowns))
-    after = base.at(shaper.ways(base), root @ np.linalg.solve(information, slope))
+    total = sum(one.told.information for one in poses)
+    slope = sum(one.told.slope for one in poses) - total @ base.unknowns
+    information = np.eye(root.shape[1]) + root.T @ total @ root
+    after = base.at(shaper.ways(base), root @ np.linalg.solve(information, root.T @ slope))
     return after.with_root(root @ np.linalg.inv(np.linalg.cholesky(information)).T)
 
 
@@ -227,8 +238,10 @@ def smoothed(
     """
     poses = list(poses)
     for _ in range(_ITERATIONS):
-        far = [k for k, one in enumerate(poses) if one.told.strays(now)]
-        if not far:
+        told = [one.told for one in poses]
+        steps = now.unknowns - np.array([one.at.unknowns for one in told])
+        far = np.flatnonzero(errors(told, steps) > _LINEAR)
+        if not len(far):
             break
         try:
             for k in far:

@@ -201,14 +201,13 @@ class Shaper:
         self._found = found if found.status == "ok" else None
         if self._found is None:
             return None if last is None else last.shapes
-        shapes = batch.start_shapes(found.x[None])
         if last is None or before is None:
-            return shapes
-        x = model.node.moved(shapes.x, model.node.difference(before.x[None], last.shapes.x))
+            return batch.start_shapes(found.x[None])
+        x = model.node.moved(found.x, model.node.difference(before.x, last.shapes.x))
         lam = last.shapes.lam.copy()
         if model.end_pull:
             lam[:, model.end_pull] += found.end_force - before.end_force
-        return replace(shapes, x=x, lam=lam)
+        return replace(last.shapes, x=x, lam=lam)
 
 
 def _places(held: HeldPose) -> dict[str, Any]:
