@@ -40,7 +40,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 from harness import options, run
-from hidden_sets import LINE, RANDOM_SIZES, STRONG, Simulated, about_axis, simulated
+from hidden_sets import LINE, POSES, RANDOM_SIZES, STRONG, Simulated, about_axis, simulated
 from simulated import random_session
 
 import dlo_casadi as dlo
@@ -144,6 +144,7 @@ def main() -> None:
     parser.add_argument("--random", default="", choices=RANDOM_SIZES, help="of each pose's own")
     parser.add_argument("--table", action="store_true", help="on a table that is not declared")
     parser.add_argument("--strong", default="", choices=STRONG, help="hidden, and large")
+    parser.add_argument("--poses", type=int, default=POSES, help="of each session")
     parser.add_argument("--each", action="store_true", help="print every set, not only odd ones")
     args = parser.parse_args()
     kind, dimension = random_effects().get(args.random), 3 if args.space else 2
@@ -153,7 +154,7 @@ def main() -> None:
     sets = range(args.first, args.first + args.sets)
     if args.plane or args.space or args.hidden or args.random or args.table or args.strong:
         asked = {"space": args.space, "hide": args.hidden, "random": args.random}
-        asked |= {"table": args.table, "strong": args.strong}
+        asked |= {"table": args.table, "strong": args.strong, "poses": args.poses}
         work = partial(run_random, seed=args.seed, **asked)
         run(work, sets, args, partial(odd_set, every=args.each), summary=summary)
     else:
@@ -236,11 +237,12 @@ def run_random(
     random: str = "",
     table: bool = False,
     strong: str = "",
+    poses: int = POSES,
 ) -> dict:
     """Simulate and fit one random session, and say what was found of its truth."""
     generator = generator_of(seed, index)
     count = 1 + index % 2 if hide else 0
-    found = simulated(generator, 3 if space else 2, count, random, table, strong)
+    found = simulated(generator, 3 if space else 2, count, random, table, strong, poses)
     begin = time.process_time()
     row = {"hidden": found.hidden, "refused": "", "wrong": [], "inside": {}, "worse": False}
     row["if_hidden"] = {}

@@ -175,15 +175,16 @@ def simulated(
     random: str = "",
     table: bool = False,
     strong: str = "",
+    size: int = POSES,
 ) -> Simulated:
     """A random session with `count` hidden effects, in the plane (2) or in space (3).
 
     `random`: what differs from pose to pose, see `PoseScatter`; nothing by default. `table`: two
     fitted poses to all that hang low enough touch a level plane. `strong`: one of STRONG that is
-    hidden between two clamps.
+    hidden between two clamps. `size`: number of poses.
     """
     while True:
-        found = _tried(generator, dimension, count, random, table, strong)
+        found = _tried(generator, dimension, count, random, table, strong, size)
         if found is not None:
             return found
 
@@ -195,6 +196,7 @@ def _tried(
     random: str,
     table: bool,
     strong: str,
+    size: int,
 ) -> Simulated | None:
     """As `simulated`; None where the poses have no stable equilibria."""
     length, mass = generator.uniform(0.5, 1.0), generator.uniform(0.03, 0.12)
@@ -223,16 +225,16 @@ def _tried(
     p = model.nominal.copy()
     for k, name in enumerate(model.names):
         p[k] = values.get(name, p[k])
-    ends = [_ends(generator, dimension, length, held, k) for k in range(POSES)]
+    ends = [_ends(generator, dimension, length, held, k) for k in range(size)]
     true = [_moved(generator, pose) for pose in ends]
     waves = generator.normal(0.0, 0.1, (len(model.node.curvatures), 3))
-    scatter, draws = PoseScatter(), np.zeros((0, POSES))
+    scatter, draws = PoseScatter(), np.zeros((0, size))
     if random:
-        size = RANDOM_SIZES[random](length) * generator.uniform(0.5, 1.5)
-        scatter = PoseScatter(size, source=random)
+        std = RANDOM_SIZES[random](length) * generator.uniform(0.5, 1.5)
+        scatter = PoseScatter(std, source=random)
         count = scatter.ways(model)[1].shape[1]
-        draws = scatter.sizes(count)[:, None] * generator.standard_normal((count, POSES))
-        values[f"random.{random}"] = size
+        draws = scatter.sizes(count)[:, None] * generator.standard_normal((count, size))
+        values[f"random.{random}"] = std
     model, shapes = _finely(model, p, waves, true, scatter, draws)
     rest = _rest(waves, model)
     if table and all(shapes):
