@@ -12,6 +12,7 @@ from scipy.optimize import least_squares
 import dlo_casadi as dlo
 from dlo_casadi.cable.estimate import Covariance
 from dlo_casadi.cable.tracked import known_of, with_known
+from dlo_casadi.effects import EdgeBias
 from dlo_casadi.tracking.inquiry import Change
 from dlo_casadi.tracking.tracker import IN_A_ROW, WINDOW, Tracker
 
@@ -301,3 +302,20 @@ def test_meaningless_arguments_are_told() -> None:
     exact = dlo.known_cable(data, gravity=(0, -9.81), boundary=("clamped", "free"))
     with pytest.raises(dlo.DloError, match="exact"):
         exact.tracker(STD)
+
+
+def test_what_photographs_do_to_points_is_not_expected_of_numbers() -> None:
+    """A cable from photographs, whose edges are off by 1 mm, is seen where it is."""
+    plain = rope()
+    model = plain.model.with_effect(EdgeBias())
+    p = np.append(plain.p, np.full(len(model.names) - len(plain.p), 1e-3))
+    names, sizes = (*NAMES, "edge_bias.a1"), (*SIZES, 1e-3)
+    old = plain.metadata
+    uncertain = replace(old.uncertainty, names=names, covariance=np.diag(np.square(sizes)))
+    cable = replace(plain, model=model, p=p, metadata=replace(old, uncertainty=uncertain))
+    held = {"start": (0.0, 0.0), "start_heading": -0.4}
+    points = cable.solve(**held).curve.at(S)
+    tracker = cable.tracker(STD)
+    found = tracker.update(dlo.Pose(points=points, at=S, **held))
+    assert found.rms < 1e-7  # tolerance of equilibria
+    assert tracker.cable.covariance.names == NAMES

@@ -76,9 +76,10 @@ class TrackedCable(EstimatedCable):
             _checked("correlated", correlated, "a distance along the cable [m]")
         if not isinstance(forget, int | float) or not 0.5 <= forget <= 1:
             raise DloError(f"forget: 0.5 to 1 belongs here, found {forget!r}")
-        names = self.covariance.names
         if self.model.has_state:
             raise DloError("tracker: a rest shape that changes from pose to pose is not tracked")
+        known = known_of(self)
+        names = known.uncertainty.names
         if not names:
             raise DloError(
                 "tracker: all parameters of this cable are exact.\n  Try: a fitted cable"
@@ -90,12 +91,13 @@ class TrackedCable(EstimatedCable):
                 raise DloError(f"drift: {name}: a standard deviation, found {value!r}")
         noise = Noise(float(std), force_std, moment_std, float(correlated))
         chosen = noise, float(forget), dict(drift or {}), compiled
-        return Tracker(known_of(self), partial(_held, self), partial(with_known, self), *chosen)
+        return Tracker(known, partial(_held, self), partial(with_known, self), *chosen)
 
 
 def known_of(cable: EstimatedCable) -> Known:
-    """Values of a cable and their uncertainty."""
-    return Known(cable.model, cable.p, cable.rest, cable.metadata.uncertainty)
+    """Values of a cable and their uncertainty, without effects of photographs."""
+    own = Known(cable.model, cable.p, cable.rest, cable.metadata.uncertainty)
+    return own.without_photographs()
 
 
 def with_known(cable: Cable, known: Known) -> Cable:

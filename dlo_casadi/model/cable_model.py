@@ -238,8 +238,10 @@ class CableModel:
         priors = {k: v for k, v in self.priors.items() if not k.startswith(f"{label}.")}
         return replace(self, effects=kept, priors=priors)
 
-    def without_kind(self, kind: type[Effect], p: FloatArray) -> tuple[Self, FloatArray]:
-        """The model without the effects of one kind, and the remaining part of `p`."""
+    def without_kind(
+        self, kind: type[Effect] | tuple[type[Effect], ...], p: FloatArray
+    ) -> tuple[Self, FloatArray]:
+        """The model without the effects of one kind, or some, and the remaining part of `p`."""
         effects = tuple(x for x in self.effects if not isinstance(x, kind))
         if effects == self.effects:
             return self, p

@@ -10,6 +10,7 @@ from typing import Self
 import numpy as np
 
 from dlo_casadi.arrays import BoolArray, FloatArray
+from dlo_casadi.effects import EdgeBias, MeasurementEffect, SensorBias
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.spread import Uncertainty
 from dlo_casadi.model.cable_model import CableModel
@@ -35,6 +36,26 @@ class Known:
     p: FloatArray
     rest: FloatArray
     uncertainty: Uncertainty
+
+    def without_photographs(self) -> Self:
+        """The same cable without what photographs do to the points that are measured in them.
+
+        Poses of a tracked cable are numbers, not photographs. A sensor of forces remains the same.
+        """
+        effects = self.model.effects
+        if not any(isinstance(item, EdgeBias) for item in effects):
+            return self
+        kinds = {type(item) for item in effects if isinstance(item, MeasurementEffect)}
+        model, p = self.model.without_kind((*(kinds - {SensorBias}),), self.p)
+        gone, own = {*self.model.names} - {*model.names}, self.uncertainty
+        kept = [k for k, name in enumerate(own.names) if name not in gone]
+        uncertainty = replace(
+            own,
+            names=tuple(own.names[k] for k in kept),
+            covariance=own.covariance[np.ix_(kept, kept)],
+            added={name: std for name, std in own.added.items() if name not in gone},
+        )
+        return replace(self, model=model, p=p, uncertainty=uncertainty)
 
     def between(self, held: HeldPose) -> Self:
         """The same cable with the clips of a pose."""
