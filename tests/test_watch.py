@@ -96,6 +96,14 @@ def test_a_table_that_grows(results, tmp_path, capsys) -> None:
     assert found == pytest.approx(tracker.params["lumped_mass.mass"].value, rel=1e-9)
 
 
+def test_a_table_without_poses_leaves_nothing(results, tmp_path, capsys) -> None:
+    for text, said in (("", "it is empty"), ("s_m,x_m,y_m\n0.1,0,0\n", "found s_m, x_m, y_m")):
+        (tmp_path / "poses.csv").write_text(text)
+        assert watch(results, tmp_path / "poses.csv") == 2
+        assert f"the column pose is missing, {said}" in capsys.readouterr().err
+        assert not (results / "watch/poses.jsonl").exists()
+
+
 def test_other_sources_and_unknown_noise_are_refused(results, tmp_path, capsys) -> None:
     write(tmp_path / "poses", 0, poses(1)[0])
     assert main(["watch", str(results), str(tmp_path / "poses"), "--once"]) == 2

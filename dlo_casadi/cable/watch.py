@@ -11,8 +11,9 @@ import json
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from dlo_casadi.cable.file import cable_of
 from dlo_casadi.cable.fitted_cable import FittedCable
@@ -73,7 +74,13 @@ class Watched:
             self._length = known["lines"]
             then = cable_of(known["tracker"]["parameters"])
             self.tracker.resume(known["tracker"], known_of(then))
-        self._lines = _opened(into / LINES, self._length)
+        if (into / LINES).exists():
+            self._lines.flush()  # lines that the state does not know go at once
+
+    @cached_property
+    def _lines(self) -> BinaryIO:
+        """The file of lines, to go on after those that are known; made with the first one."""
+        return _opened(self.into / LINES, self._length)
 
     def _known(self) -> dict[str, Any] | None:
         """The state of this source; None if there is none."""
@@ -133,10 +140,11 @@ class Watched:
 
     def close(self) -> None:
         """Close the lines."""
-        self._lines.close()
+        if "_lines" in vars(self):
+            self._lines.close()
 
 
-def _opened(path: Path, length: int) -> Any:
+def _opened(path: Path, length: int) -> BinaryIO:
     """The file of lines, to go on after so many bytes."""
     try:
         stream = path.open("ab")

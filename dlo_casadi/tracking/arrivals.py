@@ -130,7 +130,10 @@ class TableArrivals:
         """See `Arrivals`."""
         try:
             with self.path.open("rb") as file:
-                self._begin(file.readline(), file.tell())
+                first = file.readline()
+                if not (self.header or last or first.endswith(b"\n")):
+                    return  # its header is being written
+                self._begin(first, file.tell())
                 file.seek(self.offset)
                 content = file.read()
         except OSError as error:
@@ -157,8 +160,9 @@ class TableArrivals:
             self.header = first.decode("utf-8-sig", errors="replace").strip()
             names = self._cells(self.header)
             if _NAME not in names:
+                found = f"found {', '.join(names)}" if self.header else "it is empty"
                 raise DloError(
-                    f"{self.path}: the column {_NAME} is missing, found {', '.join(names)}.\n"
+                    f"{self.path}: the column {_NAME} is missing, {found}.\n"
                     f"  Try: {_NAME},{_PLACE},{','.join(f'{a}_m' for a in self.node.axes)},end_x_m"
                 )
         if not self.offset:
