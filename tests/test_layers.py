@@ -146,6 +146,7 @@ def test_the_top_holds_rooms_and_little_else():
     at_the_top = {file.name for file in FILES if file.parent == PACKAGE}
     assert at_the_top == {
         "__init__.py",
+        "__main__.py",
         "api.py",
         "arrays.py",
         "errors.py",

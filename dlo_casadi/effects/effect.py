@@ -364,6 +364,8 @@ class MeasurementEffect(Effect):
     """Kind `measurement`: from true points of the cable and true forces to measured ones."""
 
     kind: ClassVar[str] = "measurement"
+    # Whether every measurement in photographs has it, and no other.
+    photographed: ClassVar[bool] = False
 
     def observe(self, point: ca.SX, frame: ca.SX, viewpoint: Viewpoint, params: Params) -> ca.SX:
         """Measured point of the true point (dimension,) [m]. Effects are applied in order.

@@ -108,6 +108,7 @@ class EdgeBias(MeasurementEffect):
     """
 
     name = "edge_bias"
+    photographed: ClassVar = True
     dimensions = (2,)
     shown: ClassVar = False
     declared = tuple(Parameter(f"{x}{k}", "m", scale=1e-4) for k in HARMONICS for x in ("a", "b"))

@@ -10,7 +10,7 @@ from typing import Self
 import numpy as np
 
 from dlo_casadi.arrays import BoolArray, FloatArray
-from dlo_casadi.effects import EdgeBias, MeasurementEffect, SensorBias
+from dlo_casadi.effects import MeasurementEffect
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.spread import Uncertainty
 from dlo_casadi.model.cable_model import CableModel
@@ -42,11 +42,11 @@ class Known:
 
         Poses of a tracked cable are numbers, not photographs. A sensor of forces remains the same.
         """
-        effects = self.model.effects
-        if not any(isinstance(item, EdgeBias) for item in effects):
+        measuring = [x for x in self.model.effects if isinstance(x, MeasurementEffect)]
+        if not any(item.photographed for item in measuring):
             return self
-        kinds = {type(item) for item in effects if isinstance(item, MeasurementEffect)}
-        model, p = self.model.without_kind((*(kinds - {SensorBias}),), self.p)
+        of_points = {type(x) for x in measuring if type(x).observe != MeasurementEffect.observe}
+        model, p = self.model.without_kind((*of_points,), self.p)
         gone, own = {*self.model.names} - {*model.names}, self.uncertainty
         kept = [k for k, name in enumerate(own.names) if name not in gone]
         uncertainty = replace(
