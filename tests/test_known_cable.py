@@ -375,6 +375,7 @@ def test_a_known_load_may_be_many_times_the_weight(tmp_path, load):
             {"boundary": ("pinned", "hinged")},
             "boundary: allowed are 'pinned', 'clamped', 'swivel'",
         ),
+        (ROPE, {"boundary": ("pinned", "free", "x")}, "[start, end] belongs here, such as"),
         (ROPE, {"boundary": "pinned"}, "[start, end] belongs here, such as [pinned, clamped]"),
         (
             ROPE,

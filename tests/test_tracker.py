@@ -319,3 +319,13 @@ def test_what_photographs_do_to_points_is_not_expected_of_numbers() -> None:
     found = tracker.update(dlo.Pose(points=points, at=S, **held))
     assert found.rms < 1e-7  # tolerance of equilibria
     assert tracker.cable.covariance.names == NAMES
+
+
+def test_markers_beyond_the_cable_are_an_error_and_nothing_is_learned() -> None:
+    tracker = rope().tracker(STD)
+    wrong = dlo.Pose(
+        points=[[0.1, 0.0], [0.5, -0.1]], at=[0.1, 0.9], start=(0, 0), start_heading=0.1
+    )
+    with pytest.raises(dlo.DloError, match=r"at: 0.9 m .*0.6 m"):
+        tracker.update(wrong)
+    assert repr(tracker).startswith("tracker after 0 poses: bending_stiffness 0.009 (std 0.002)")

@@ -61,7 +61,7 @@ from dlo_casadi.rod.supports import SupportKind
 def _both_ends(value: object) -> object:
     if isinstance(value, list | tuple) and len(value) == 2:
         return dict(zip(("start", "end"), value, strict=True))
-    if isinstance(value, str) and value != PLACEHOLDER:
+    if isinstance(value, str | list | tuple) and value != PLACEHOLDER:
         raise ValueError(f"[start, end] belongs here, such as [pinned, clamped], found {value!r}")
     return value
 

@@ -243,17 +243,16 @@ FINDINGS: tuple[Sentence[Outcome], ...] = (
 
 def separation_text(proposal: NextPose) -> str:
     """Difference of rivals in a proposed pose, and how often it has to be measured."""
-    text = (
+    apart = (
         f"they differ there by {millimetres(proposal.difference)} RMS, {proposal.separation:.2g} "
-        "standard deviations of one measured line, its fixtures and what both fits leave open: "
+        "standard deviations of one measured line, its fixtures and what both fits leave open"
     )
     if proposal.times is None:
-        return text + f"even {MOST_REPEATS} measurements would not tell them apart."
-    return text + (
-        "one measurement suffices."
-        if proposal.times == 1
-        else f"measure it {proposal.times} times."
+        return f"even {MOST_REPEATS} measurements would not tell them apart: {apart}."
+    times = (
+        "one measurement suffices" if proposal.times == 1 else f"measure it {proposal.times} times"
     )
+    return f"{apart}: {times}."
 
 
 def let_go_text(motion: NextMotion) -> str:

@@ -14,6 +14,7 @@ from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.rod.quantities import quantity_of
+from dlo_casadi.rod.supports import place_problem
 from dlo_casadi.sensing.noise import correlation
 
 # Share of the noise of a line that is correlated, if any is; the rest keeps close points apart.
@@ -89,6 +90,10 @@ class Measured:
         if len(values) != len(rows):
             raise DloError(f"readings: {len(rows)} components belong here, found {len(values)}")
         s = np.zeros(len(points)) if pose.at is None else np.asarray(pose.at, dtype=float)
+        if pose.at is not None:
+            each = (place_problem(float(x), model.cable.length, model.loose) for x in s)
+            for text in filter(None, each):
+                raise DloError(f"at: {text}.\n  Try: arc lengths from the start, in metres")
         readings = np.array(values), rows, np.array(std)
         return cls(points, s, pose.at is not None, *readings, noise)
 

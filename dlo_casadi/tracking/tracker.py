@@ -19,7 +19,7 @@ import numpy as np
 
 from dlo_casadi.config import Pose
 from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.errors import DloError
+from dlo_casadi.errors import DloError, counted
 from dlo_casadi.io.files import finite
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.tracking.changes import Jumps, Probe
@@ -79,6 +79,13 @@ class Tracker(TrackerInMotion):
         self._begin()
         self._go_on_from(self._known)
         self._end_motion()
+
+    def __repr__(self) -> str:
+        known = {n: s for n, s in self._known.stds.items() if n in self._known.model.names}
+        values = (
+            f"{n} {self._known.value(n, self._known):.4g} (std {s:.1g})" for n, s in known.items()
+        )
+        return f"tracker after {counted(self.count, 'pose')}: {', '.join(values)}"
 
     def _go_on_from(self, known: Known) -> None:
         """What is known before the next pose; what earlier ones told stays as it is."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from dlo_casadi.arrays import FloatArray
+from dlo_casadi.errors import counted
 from dlo_casadi.tracking.inquiry import Change
 
 
@@ -38,6 +39,8 @@ class Update:
     iterations: int
 
     def __repr__(self) -> str:
+        if not self.innovation.size:
+            return "nothing to compare with a prediction"
         text = f"{1e3 * self.rms:.3g} mm off the prediction, p = {self.probability:.2g}"
         text += ", refused" if self.refused else ""
         return text + (f", {self.change}" if self.change else "")
@@ -61,3 +64,8 @@ class Ahead:
     s: FloatArray
     points: FloatArray
     std: FloatArray
+
+    def __repr__(self) -> str:
+        times = f"{counted(len(self.t), 'instant')} from {self.t[0]:g} to {self.t[-1]:g} s"
+        most = f"std up to {1e3 * self.std.max():.3g} mm"
+        return f"{times}, {counted(len(self.s), 'place')} on the cable, {most}"
