@@ -182,9 +182,10 @@ class HeldPose:
         for side, kind, tension in zip(("start", "end"), held, self.tensions, strict=True):
             if (kind.slides and not by_length) != (tension is not None):
                 is_it = f"is {tension:g} N" if tension is not None else "is missing"
-                also = f", free_length {self.free_length:g} m: one determines the other"
-                also = also if kind.slides and self.free_length is not None else ""
-                return f"the {side} of the cable is {kind}, {side}_tension {is_it}{also}"
+                text = f"the {side} of the cable is {kind}, {side}_tension {is_it}"
+                if not kind.slides or self.free_length is None:
+                    return text
+                return f"{text}, free_length {self.free_length:g} m: one determines the other"
         slides = any(kind.slides for kind in held)
         if (slides and by_length) != (self.free_length is not None):
             is_it = f"is {self.free_length:g} m" if self.free_length is not None else "is missing"
