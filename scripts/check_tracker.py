@@ -228,7 +228,10 @@ def at_once(cable: dlo.FittedCable, poses: list[dlo.Pose]) -> tuple[Any, np.ndar
         rows = [
             (
                 ((pose.points - told.curve.at(S)) / STD).ravel(),
-                -told.curve.moved(S, change.curve).reshape(len(S) * model.node.dimension, -1) / STD,
+                -told.curve.moved(S, change.curve, change.knots, marked=True).reshape(
+                    len(S) * model.node.dimension, -1
+                )
+                / STD,
             )
             for pose, (told, change) in zip(
                 poses, batch.observe(shapes, now.p, now.rest, along), strict=True

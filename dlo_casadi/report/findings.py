@@ -166,7 +166,7 @@ def _hidden(outcome: Outcome) -> Iterator[Values]:
             other = "So would another pose" if far else "No other pose would tell"
             telling += worded(_TURNED, other=other, tip=tip, expected=expected)
         if found.motion is not None and (swings := told_by(found.motion)):
-            telling += f" So would a motion: {let_go_text(found.motion)}; {swings}."
+            telling += f" A motion would tell: {let_go_text(found.motion)}; {swings}."
         sizes = (f"{key} {x.value:.2g} {x.unit}".strip() for key, x in found.values.items())
         yield {
             "found": found,

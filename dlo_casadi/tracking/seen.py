@@ -85,9 +85,9 @@ def errors(told: Sequence[Told], steps: FloatArray) -> FloatArray:
 
     It is the first-order one times how far nodes turn or stiffnesses change by the steps (m, n).
     """
-    columns = np.array([one.information for one in told])
+    information = np.array([one.information for one in told])
     turns = np.array([one.turns for one in told])
-    felt = np.maximum(np.einsum("mi,mij,mj->m", steps, columns, steps), 0.0)
+    felt = np.maximum(np.einsum("mi,mij,mj->m", steps, information, steps), 0.0)
     rise = np.abs(steps * told[0].at.are_logs).max(axis=1)
     turned = np.abs(turns @ steps[..., None]).max(axis=(1, 2))
     return np.asarray(np.maximum(rise, turned) * np.sqrt(felt) / 2)
