@@ -8,7 +8,7 @@ the vision. The motion is simulated with 40 elements, the fit uses fewer. Each s
 files to a temporary folder and is fitted like any other.
 
 Exit code 1 if a damping is off by more than 10 % or 3 std, if EI lies outside of its interval, or
-if an effect is named: none is hidden.
+if the verdict is not `complete`: nothing is hidden.
 """
 
 from __future__ import annotations
@@ -65,9 +65,9 @@ class Row(NamedTuple):
 
     @property
     def right(self) -> bool:
-        """Whether damping and EI are as they should be, and nothing is named."""
-        off = abs(self.damping - 1)
-        return self.inside and off < 0.1 and off < 3 * self.damping_std and not self.found
+        """Whether damping and EI are as they should be, and nothing is missing."""
+        off, complete = abs(self.damping - 1), self.verdict == "complete"
+        return self.inside and off < 0.1 and off < 3 * self.damping_std and complete
 
 
 def board() -> FloatArray:

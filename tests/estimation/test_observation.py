@@ -351,6 +351,22 @@ def test_slow_errors_beside_smooth_ones_are_seen_in_dense_points():
     assert np.abs(errors).max() < 0.35
 
 
+def test_errors_that_end_within_a_stretch_do_not_average_out_over_its_points():
+    """Averages over eight points: those far apart are independent, near ones share their errors."""
+    s = np.linspace(0.01, LENGTH - 0.01, 200)
+    average = np.convolve(np.ones(6), np.ones(3))
+    rows = np.array([np.pad(average, (k, 199 - k)) for k in range(200)])
+    true = log_slow_variance(rows @ rows.T + 1e-6 * np.eye(200), s)
+    own, none = smooth_modes(s, LENGTH, 4, free_end=False), np.zeros((200, 0))
+    for seed in range(5):
+        drawn = np.random.default_rng(seed).normal(size=(5, 207))
+        samples = [NoiseSample(rows @ one, s, np.ones(200), own, none) for one in drawn]
+        found = estimate_noise(samples, LENGTH)
+        error = log_slow_variance(found.covariance(s, np.ones(200)), s) - true
+        # By its own account the standard deviation is 0.17 to 0.7.
+        assert abs(error) < 2.5 * np.sqrt(2 / found.slow_dof)
+
+
 def test_how_well_slow_modes_are_known_is_that_of_their_likelihood():
     """Of one kernel, by sums over a grid of shares and lengths, uniform in the share."""
     samples = simulated(NoiseModel(3e-4, 0.5, 0.03, "gaussian"), 12, 60)
