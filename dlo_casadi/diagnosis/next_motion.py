@@ -1,17 +1,20 @@
 """The motion that would separate two models which explain the same still poses.
 
 Pulled aside and let go, a cable swings in its modes. Two models of the same shapes predict other
-frequencies: of modes k with the differences d_k = log(w_k / w'_k) they are
+frequencies and shapes of modes. With the differences d of log(w_k), and of the unit vectors u_k of
+the modes' displacements in all measured coordinates, they are
 
     sqrt(d^T (E + P)^-1 d)
 
 standard deviations apart. P is what the rival's parameters leave open, and what may differ in
-motion within tolerances (TOLERATED_IN_MOTION). E is diagonal: a mode of amplitude a, seen in N
-coordinates of a std sigma at times t, tells its rate with the variance
+motion within tolerances (TOLERATED_IN_MOTION). E is diagonal: a mode of amplitude a, a vector of
+all coordinates, which have a std sigma, seen at times t, tells its rate and its shape with
 
-    var(w) = 2 sigma^2 / (a^2 N sum_t g (t - m)^2),   g = exp(-2 zeta w t),   m = sum g t / sum g
+    var(w) = 2 sigma^2 / (|a|^2 sum_t g (t - m)^2),   g = exp(-2 zeta w t),   m = sum g t / sum g
+    var(u) = 2 sigma^2 / (|a|^2 sum_t g)              of each component across u
 
-whatever its phase, amplitude and damping are. That is the bound of Cramer and Rao.
+whatever its phase, amplitude and damping are. That is the bound of Cramer and Rao. Of a shape only
+what differs from all modes counts whose beat with it lasts longer than the recording.
 
 References
 ----------
@@ -23,7 +26,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -36,6 +40,7 @@ from dlo_casadi.errors import DloError
 from dlo_casadi.estimation.motion_fit import MESH_ERROR, moving_model
 from dlo_casadi.estimation.prediction import uncertainty_of
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.motion.modes import displacements
 from dlo_casadi.motion.modes_at_rest import ModesAtRest, directions
 from dlo_casadi.sensing.sensors import Markers
 
@@ -57,8 +62,8 @@ class Swing:
     ----------
     frequencies : (MODES,) [Hz]
     separation : float
-        Difference of its first modes in standard deviations. Half its square is the log evidence
-        that the motion is expected to give.
+        Difference of its first modes, rates and shapes, in standard deviations. Half its square is
+        the log evidence that the motion is expected to give, to first order.
     """
 
     frequencies: tuple[float, ...]
@@ -121,7 +126,8 @@ def next_motion(fit: Fit, others: Mapping[str, Fit], of: str = "") -> NextMotion
         with suppress(DloError):
             own = _modes_of(fit, pose)
             each = {name: _modes_of(one, pose) for name, one in rivals.items()}
-            gaps = [np.abs(_gap(own, one)).max() for one in each.values()]
+            hertz = own.numbers()[0]
+            gaps = [np.abs(np.log(hertz / one.numbers()[0])).max() for one in each.values()]
             tried.append((min(gaps), own, each))
     # A cable may lose its shape within what is known of its parameters.
     for _, own, each in sorted(tried, key=lambda x: -x[0]):
@@ -151,9 +157,43 @@ def _modes_of(fit: Fit, pose: HeldPose) -> ModesAtRest:
     return modes
 
 
-def _gap(own: ModesAtRest, rival: ModesAtRest) -> FloatArray:
-    """Logarithms (MODES,) of the ratios of frequencies."""
-    return np.log(own.numbers()[0] / rival.numbers()[0])
+@dataclass(frozen=True)
+class _Shown:
+    """How modes differ from those of a fit, at arc lengths s (K,) [m].
+
+    Parameters
+    ----------
+    alike : tuple of (K d, q)
+        Of each mode, unit shapes of the fit's modes that are not told from it.
+    first : (MODES, K d)
+        The fit's unit shapes, which decide the signs.
+    """
+
+    s: FloatArray
+    alike: tuple[FloatArray, ...]
+    first: FloatArray
+
+    @classmethod
+    def beside(cls, own: ModesAtRest, s: FloatArray) -> Self:
+        """Beside a fit's modes."""
+        rates, shapes = _rates_and_shapes(replace(own, count=2 * MODES), s)
+        beats = np.abs(rates[:MODES, None] - rates) * DURATION < 2 * np.pi
+        alike = tuple(np.linalg.qr(shapes[near].T)[0] for near in beats)
+        return cls(s, alike, shapes[:MODES])
+
+    def of(self, modes: ModesAtRest) -> FloatArray:
+        """Logarithms (MODES,) of the rates, then what differs of the shapes (MODES K d,)."""
+        rates, shapes = _rates_and_shapes(modes, self.s)
+        signed = shapes * np.where((shapes * self.first).sum(axis=1) < 0, -1.0, 1.0)[:, None]
+        across = [u - q @ (q.T @ u) for u, q in zip(signed, self.alike, strict=True)]
+        return np.concatenate([np.log(rates), *across])
+
+
+def _rates_and_shapes(modes: ModesAtRest, s: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Rates (count,) [rad/s] and unit shapes (count, K d) of modes at arc lengths."""
+    cable, state, found = modes.state()
+    shapes = displacements(cable, state, found.vectors, s)[1].reshape(modes.count, -1)
+    return found.rates, shapes / np.linalg.norm(shapes, axis=1, keepdims=True)
 
 
 def _compared(
@@ -165,49 +205,53 @@ def _compared(
 ) -> NextMotion:
     """How far the modes of rivals are apart from a fit's in one pose."""
     length, model, (hertz, ratios) = fit.model.cable.length, own.model, own.numbers()
-    s = np.linspace(0.0, length, 101)
-    shapes = np.linalg.norm(own.displacements(s)[1], axis=2)
-    aside = length * (ASIDE_HELD if model.end.place else ASIDE)
-    # Of a shape that is pulled at one place; of each mode, the mean square of a coordinate.
-    sizes = aside * (hertz[0] / hertz) ** 2
-    squares = sizes**2 * (shapes**2).mean(axis=1) / model.node.dimension
+    aside, seen = length * (ASIDE_HELD if model.end.place else ASIDE), _places(fit)
+    # Of a shape that is pulled at one place.
+    amplitudes = aside * (hertz[0] / hertz) ** 2
+    sizes = amplitudes * np.linalg.norm(own.displacements(seen)[1], axis=(1, 2))
     std, rates = float(np.hypot(fit.noise.std, MESH_ERROR * length)), 2 * np.pi * hertz
-    told = std**2 * np.array([*_variances(rates, ratios, squares, _count(fit))]) / rates**2
+    of_rates, of_shapes = std**2 * np.transpose([*_variances(rates, ratios, sizes)])
+    shown, count = _Shown.beside(own, seen), len(seen) * model.node.dimension
+    told = np.concatenate([of_rates / rates**2, np.repeat(of_shapes, count)])
     swings = {}
     for name, rival in each.items():
-        gap = _gap(own, rival)
-        apart = gap @ np.linalg.solve(np.diag(told) + _left_open(others[name], rival), gap)
+        gap = shown.of(own) - shown.of(rival)
+        left = np.diag(told) + _left_open(others[name], rival, shown)
+        apart = gap @ np.linalg.solve(left, gap)
         swings[name] = Swing(tuple(rival.numbers()[0].tolist()), float(np.sqrt(apart)))
+    s = np.linspace(0.0, length, 101)
+    shapes = np.linalg.norm(own.displacements(s)[1], axis=2)
     at = float(s[int(shapes[0].argmax())])
     return NextMotion(own.pose.name, at, aside, DURATION, tuple(hertz.tolist()), swings, of)
 
 
-def _count(fit: Fit) -> int:
-    """Numbers that are compared at each time."""
-    item = next(item for item in fit.problem.fit_poses if item.has_points)
-    sensor, dimension = item.sensors[0], fit.model.node.dimension
-    return (len(sensor.points) if isinstance(sensor, Markers) else POINTS) * dimension
+def _places(fit: Fit) -> FloatArray:
+    """Arc lengths (K,) [m] of the points that are compared."""
+    sensor = next(item for item in fit.problem.fit_poses if item.has_points).sensors[0]
+    if isinstance(sensor, Markers):
+        return sensor.s
+    return (np.arange(POINTS) + 0.5) / POINTS * fit.model.cable.length
 
 
 def _variances(
-    rates: FloatArray, ratios: FloatArray, squares: FloatArray, count: int
-) -> Iterator[float]:
-    """Variance of each rate [rad/s], of noise 1, from mean squares of the modes' amplitudes."""
+    rates: FloatArray, ratios: FloatArray, sizes: FloatArray
+) -> Iterator[tuple[float, float]]:
+    """Variances of each rate [rad/s] and of its shape, of noise 1, from the modes' amplitudes."""
     t = np.arange(0.0, DURATION, 1 / RATE)
-    for rate, ratio, square in zip(rates, ratios, squares, strict=True):
+    for rate, ratio, size in zip(rates, ratios, sizes, strict=True):
         g = np.exp(-2 * ratio * rate * t)
         spread = g @ (t - g @ t / g.sum()) ** 2
-        yield 2 / (square * count * spread)
+        yield 2 / (size**2 * spread), 2 / (size**2 * g.sum())
 
 
-def _left_open(fit: Fit, modes: ModesAtRest) -> FloatArray:
-    """Covariance of the logarithms of a fit's rates."""
+def _left_open(fit: Fit, modes: ModesAtRest, shown: _Shown) -> FloatArray:
+    """Covariance of what is shown of a fit's modes."""
     ways = directions(modes.model, uncertainty_of(fit))
     for name, std in modes.model.priors.items():
         if name not in fit.model.names:  # tolerated in motion
             p = np.zeros(len(modes.p))
             p[modes.model.names.index(name)] = std
             ways.append((p, np.zeros(len(modes.rest))))
-    known = modes.numbers()[0]
-    moved = [np.log(modes.moved(p, rest)[0] / known) for p, rest in ways]
+    known = shown.of(modes)
+    moved = [shown.of(modes.moved(p, rest)) - known for p, rest in ways]
     return np.transpose(moved) @ np.array(moved)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -90,7 +91,8 @@ class ModesAtRest:
         """Standard deviations (2, count) of `numbers` under a fit's covariance, to first order."""
         total = np.zeros((2, self.count))
         for p, rest in directions(self.model, known):
-            total += (self.moved(p / 2, rest / 2) - self.moved(-p / 2, -rest / 2)) ** 2
+            ahead, behind = (self.moved(way * p, way * rest).numbers() for way in (0.5, -0.5))
+            total += (ahead - behind) ** 2
         return np.sqrt(total)
 
     def displacements(self, s: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -101,11 +103,11 @@ class ModesAtRest:
         moving, state, found = self.state()
         return displacements(moving, state, found.vectors, s)
 
-    def moved(self, p: FloatArray, rest: FloatArray) -> FloatArray:
-        """`numbers` of the cable with changed parameters and rest strains, in the same pose."""
+    def moved(self, p: FloatArray, rest: FloatArray) -> Self:
+        """Those of the cable with changed parameters and rest strains, in the same pose."""
         p, rest = self.p + p, self.rest + rest
         own = solve_equilibrium(self.model, p, rest, self.pose, x_init=self.equilibrium.x)
-        return ModesAtRest(self.model, p, rest, own, self.pose, self.count).numbers()
+        return replace(self, p=p, rest=rest, equilibrium=own)
 
 
 def directions(model: CableModel, known: Uncertainty) -> list[tuple[FloatArray, FloatArray]]:

@@ -3,20 +3,24 @@
 import numpy as np
 import pytest
 
+import dlo_casadi as dlo
 from dlo_casadi.diagnosis.next_motion import (
     ASIDE,
     DURATION,
     RATE,
+    NextMotion,
     _variances,
     next_motion,
 )
 from dlo_casadi.effects import CableData, Effect, ImageScale, LumpedMass, PointForce
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.fit import fit_model
+from dlo_casadi.estimation.motion_fit import fit_motions
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.tolerances import Tolerances
+from dlo_casadi.sensing.measured_motion import MeasuredMotion
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 
 LENGTH, MASS, PLACE, STD = 0.6, 0.012, 0.45, 4e-4
@@ -58,8 +62,10 @@ def test_a_rate_is_known_as_well_as_linear_least_squares_knows_it() -> None:
     x, y = decay * np.cos(w * t), decay * np.sin(w * t)
     by = np.stack([x, y, -size * t * x, -size * t * y], axis=1)
     variance = np.linalg.inv(by.T @ by)[3, 3]
-    found = list(_variances(np.array([w]), np.array([zeta]), np.array([size**2]), 1))
-    assert found == pytest.approx([variance], rel=0.02)
+    ((of_rate, of_shape),) = _variances(np.array([w]), np.array([zeta]), np.array([size]))
+    assert of_rate == pytest.approx(variance, rel=0.02)
+    # Another coordinate, in which the mode is not seen, has a share of its wave in phase.
+    assert of_shape == pytest.approx(1 / (size**2 * x @ x), rel=0.02)
 
 
 def test_a_weight_swings_slower_than_a_force(measured: list[MeasuredPose]) -> None:
@@ -73,6 +79,42 @@ def test_a_weight_swings_slower_than_a_force(measured: list[MeasuredPose]) -> No
     assert told.aside == pytest.approx(ASIDE * LENGTH)
     assert rival.frequencies[0] > 1.05 * told.frequencies[0]
     assert rival.separation > 6.3, "a log evidence of 20"
+
+
+def let_go(told: NextMotion, pose: HeldPose) -> MeasuredMotion:
+    """What a camera sees of the proposed motion, of the cable with the weight."""
+    s, t = np.linspace(0.1, 1.0, 8) * LENGTH, np.arange(0.0, told.duration, 1 / RATE)
+    weight = {"name": "lumped_mass", "parameters": {"mass": MASS, "position": PLACE}}
+    own = dlo.Cable(length=LENGTH, mass=0.08, diameter=0.008, bending_stiffness=0.012)
+    known = {"gravity": (0.0, -9.81), "model": {"n": 24, "effects": [weight]}}
+    held = {"start": pose.start, "start_heading": pose.start_heading}
+    free = dlo.known_cable(own, **known, boundary=("clamped", "free")).with_damping(0.02)
+    tied = dlo.known_cable(own, **known, boundary=("clamped", "pinned"))
+    # Across the cable, and back to the tip's distance from the clamp.
+    tip, before = free.solve(**held).curve.at(np.array([told.at, told.at - 0.01]))
+    ahead = (tip - before) / np.linalg.norm(tip - before)
+    end = tip + told.aside * np.array([-ahead[1], ahead[0]])
+    end *= 0.98 * np.linalg.norm(tip) / np.linalg.norm(end)
+    points = free.simulate(t, begins=tied.solve(**held, end=end), **held).at(s)
+    points += STD * np.random.default_rng(1).normal(size=points.shape)
+    resting = {key: np.array(x) for key, x in held.items()}
+    none = np.zeros(0)
+    return MeasuredMotion("go", t, points, s, none, {}, resting, at_rest=False, held_out=False)
+
+
+def test_the_motion_gives_the_evidence_that_is_promised(measured: list[MeasuredPose]) -> None:
+    """Within twice the standard deviations: first order, and three modes of small motions."""
+    fits = [fitted(measured, effect) for effect in (LumpedMass(), PointForce())]
+    told = next_motion(fits[0], {"point_force": fits[1]})
+    assert told is not None
+    (pose,) = (item.pose for item in measured if item.pose.name == told.pose)
+    go = let_go(told, pose)
+    moved = [fit_motions(fit, [go], STD) for fit in fits]
+    weight, force = (x.objective - y.point.objective for x, y in zip(moved, fits, strict=True))
+    assert moved[0].chi2_per_dof < 1.1
+    separation = np.sqrt(2 * (force - weight))
+    assert told.rivals["point_force"].separation / 2 < separation
+    assert separation < 2 * told.rivals["point_force"].separation
 
 
 def test_what_swings_alike_is_not_apart(measured: list[MeasuredPose]) -> None:
