@@ -34,9 +34,8 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.diagnosis.selection import AddedEffect, rivals_of
 from dlo_casadi.effects import MeasurementEffect
-from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.equilibrium.solve import solve_equilibrium
-from dlo_casadi.errors import DloError
+from dlo_casadi.equilibrium.solve import solve_equilibria
+from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.estimation.motion_fit import MESH_ERROR, moving_model
 from dlo_casadi.estimation.prediction import uncertainty_of
 from dlo_casadi.estimation.result import Fit
@@ -117,18 +116,18 @@ def next_motion(fit: Fit, others: Mapping[str, Fit], of: str = "") -> NextMotion
     without any, and where motion does not know a part of the cable, such as obstacles.
     """
     rivals = {name: one for name, one in others.items() if not _seen_otherwise(fit, one)}
-    poses = [item.pose for item in fit.problem.fit_poses if item.has_points]
-    if not poses or not rivals:
+    told = [j for j, item in enumerate(fit.problem.fit_poses) if item.has_points]
+    if not told or not rivals:
         return None
-    picked = np.unique(np.linspace(0, len(poses) - 1, TRIED).round().astype(int))
+    picked = np.unique(np.linspace(0, len(told) - 1, TRIED).round().astype(int))
+    of_each = [_modes_of(one, [told[k] for k in picked]) for one in (fit, *rivals.values())]
     tried = []
-    for pose in (poses[k] for k in picked):
+    for modes in zip(*of_each, strict=True):
         with suppress(DloError):
-            own = _modes_of(fit, pose)
-            each = {name: _modes_of(one, pose) for name, one in rivals.items()}
+            own, *others_here = map(_held, modes)
             hertz = own.numbers()[0]
-            gaps = [np.abs(np.log(hertz / one.numbers()[0])).max() for one in each.values()]
-            tried.append((min(gaps), own, each))
+            gaps = [np.abs(np.log(hertz / one.numbers()[0])).max() for one in others_here]
+            tried.append((min(gaps), own, dict(zip(rivals, others_here, strict=True))))
     # A cable may lose its shape within what is known of its parameters.
     for _, own, each in sorted(tried, key=lambda x: -x[0]):
         with suppress(DloError):
@@ -143,15 +142,27 @@ def _seen_otherwise(fit: Fit, other: Fit) -> bool:
     return any(isinstance((known[0] | known[1])[label], MeasurementEffect) for label in apart)
 
 
-def _modes_of(fit: Fit, pose: HeldPose) -> ModesAtRest:
-    """Modes about the shape in a pose of a fit's cable in motion."""
+def _modes_of(fit: Fit, of: Sequence[int]) -> list[ModesAtRest | EquilibriumError]:
+    """Modes of a fit's cable about its shapes in some of its poses, without random differences."""
     model = moving_model(fit.model)
     known = dict(zip(fit.model.names, fit.p.tolist(), strict=True))
     nominal = dict(zip(model.names, model.nominal.tolist(), strict=True))
     p = np.array([known.get(name, nominal[name]) for name in model.names])
-    found = solve_equilibrium(model, p, fit.rest_now, pose)
-    modes = ModesAtRest(model, p, fit.rest_now, found, pose, MODES)
-    cable, _, own = modes.state()
+    poses = [fit.problem.fit_poses[j].pose for j in of]
+    found = solve_equilibria(model, p, fit.rest_now, poses, list(fit.point.shapes.x[of]))
+    return [
+        one
+        if isinstance(one, EquilibriumError)
+        else ModesAtRest(model, p, fit.rest_now, one, pose, MODES)
+        for one, pose in zip(found, poses, strict=True)
+    ]
+
+
+def _held(modes: ModesAtRest | EquilibriumError) -> ModesAtRest:
+    """The modes, if there is a shape and if something holds each of them."""
+    if isinstance(modes, EquilibriumError):
+        raise modes
+    cable, _, own = modes.state
     if own.rates.min() < FREE * cable.slowest:
         raise DloError("a mode that nothing holds, such as a roll about ball joints, has no rate")
     return modes

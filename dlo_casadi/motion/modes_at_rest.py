@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -68,6 +69,7 @@ class ModesAtRest:
     pose: HeldPose
     count: int
 
+    @cached_property
     def state(self) -> tuple[MovingCable, State, DampedModes]:
         """The cable about its shape, its state there, and its modes.
 
@@ -84,7 +86,7 @@ class ModesAtRest:
 
     def numbers(self) -> FloatArray:
         """Frequencies w / (2 pi) [Hz] and damping ratios (2, count); raises as `state` does."""
-        _, _, found = self.state()
+        _, _, found = self.state
         return np.stack([found.rates / (2 * np.pi), found.damping_ratios])
 
     def std(self, known: Uncertainty) -> FloatArray:
@@ -100,7 +102,7 @@ class ModesAtRest:
 
         The largest displacement of each mode is 1.
         """
-        moving, state, found = self.state()
+        moving, state, found = self.state
         return displacements(moving, state, found.vectors, s)
 
     def moved(self, p: FloatArray, rest: FloatArray) -> Self:
