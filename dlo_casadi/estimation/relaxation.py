@@ -257,12 +257,12 @@ class Relaxation:
         """Derivatives and residuals of all terms of the objective."""
         problem = self.problem
         equilibria = problem.equilibria
-        nodes, _, _, known, _ = self._counts
+        nodes, border, _, known, _ = self._counts
         here, along = self._at(values), self._along(values)
         _, force, matrix = here.balance()
-        still = replace(along, x=np.zeros_like(along.x), lam=np.zeros_like(along.lam))
-        rows = here.balance_along(still).rows
         tangent = matrix.dense()
+        rows = np.zeros((*tangent.shape[:2], along.p.shape[2]))
+        rows[:, :, border:] = here.balance_along(along.numbers(slice(border, None))).rows
         rows[:, :, :nodes] += tangent[:, :, :nodes]
         rows += tangent[:, :, nodes:] @ along.lam
         weights, left = self._weights(values.theta), force.rows[:, :, 0]

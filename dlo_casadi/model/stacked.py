@@ -124,6 +124,12 @@ class Tangents:
     deviation: FloatArray
     tangent: BandMatrix | None = None
 
+    def numbers(self, columns: slice) -> Tangents:
+        """Some of the directions, with the shapes held: those of p, rest and deviation."""
+        p, rest, deviation = (x[..., columns] for x in (self.p, self.rest, self.deviation))
+        x, lam = (np.zeros((*part.shape[:-1], p.shape[-1])) for part in (self.x, self.lam))
+        return Tangents(x, lam, p, rest, deviation)
+
 
 def repeated(rows: FloatArray, count: int) -> FloatArray:
     """Rows (m, k) of poses, repeated for `count` segments or stations (m, count, k)."""
