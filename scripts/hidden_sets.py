@@ -236,7 +236,7 @@ def _tried(
         draws = scatter.sizes(count)[:, None] * generator.standard_normal((count, size))
         values[f"random.{random}"] = std
     model, shapes = _finely(model, p, waves, true, scatter, draws)
-    rest = _rest(waves, model)
+    rest = rest_of(waves, model)
     if table and all(shapes):
         height = _table_under(generator, model, true, shapes)
         model = model.with_effect(ContactPlane())
@@ -312,7 +312,7 @@ def _shapes(
     draws: NDArray[np.floating],
 ) -> list[Prediction | None]:
     """Shapes of the poses on a model's mesh, each with what it has of its own."""
-    rest = _rest(waves, model)
+    rest = rest_of(waves, model)
     if not scatter.std:
         return predict_poses(model, p, rest, poses)
     effect = effect_of(scatter.source, model)
@@ -359,7 +359,7 @@ def _held_out(k: int) -> bool:
     return k % 5 == 4
 
 
-def _rest(waves: NDArray[np.floating], model: CableModel) -> NDArray[np.floating]:
+def rest_of(waves: NDArray[np.floating], model: CableModel) -> NDArray[np.floating]:
     """A smooth rest curvature [1/m], three waves (axes, 3) about each axis."""
     length, node, k = model.cable.length, model.node, np.arange(3)[:, None]
     cells = model.chain.cells / length
