@@ -202,7 +202,7 @@ class _Shown:
 
 def _rates_and_shapes(modes: ModesAtRest, s: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Rates (count,) [rad/s] and unit shapes (count, K d) of modes at arc lengths."""
-    cable, state, found = modes.state()
+    cable, state, found = modes.state
     shapes = displacements(cable, state, found.vectors, s)[1].reshape(modes.count, -1)
     return found.rates, shapes / np.linalg.norm(shapes, axis=1, keepdims=True)
 
