@@ -342,6 +342,8 @@ def judged(outcome: Outcome) -> Outcome:
     poses = () if outcome.config.estimation.robust else outcome.poses
     said = fit_warnings(fit, outcome.mesh_error, declared, poses)
     said += remarks.worse_than_simpler(stages)
+    coefficients = outcome.config.estimation.rest_curvature_coefficients
+    said += remarks.smooth_rest(fit, outcome.effects, coefficients)
     said += [remarks.CUT_OFF] if outcome.cut_off else []
     if fit.model.cable.straight and outcome.config.cable.rest_shape == "curved":
         said.append(remarks.TAKEN_AS_STRAIGHT)
