@@ -116,11 +116,11 @@ def next_motion(fit: Fit, others: Mapping[str, Fit], of: str = "") -> NextMotion
     without any, and where motion does not know a part of the cable, such as obstacles.
     """
     rivals = {name: one for name, one in others.items() if not _seen_otherwise(fit, one)}
-    told = [j for j, item in enumerate(fit.problem.fit_poses) if item.has_points]
-    if not told or not rivals:
+    measured = [j for j, item in enumerate(fit.problem.fit_poses) if item.has_points]
+    if not measured or not rivals:
         return None
-    picked = np.unique(np.linspace(0, len(told) - 1, TRIED).round().astype(int))
-    of_each = [_modes_of(one, [told[k] for k in picked]) for one in (fit, *rivals.values())]
+    picked = np.unique(np.linspace(0, len(measured) - 1, TRIED).round().astype(int))
+    of_each = [_modes_of(one, [measured[k] for k in picked]) for one in (fit, *rivals.values())]
     tried = []
     for modes in zip(*of_each, strict=True):
         with suppress(DloError):
@@ -223,13 +223,13 @@ def _compared(
     std, rates = float(np.hypot(fit.noise.std, MESH_ERROR * length)), 2 * np.pi * hertz
     of_rates, of_shapes = std**2 * np.transpose([*_variances(rates, ratios, sizes)])
     shown, count = _Shown.beside(own, seen), len(seen) * model.node.dimension
-    told = np.concatenate([of_rates / rates**2, np.repeat(of_shapes, count)])
+    variances = np.concatenate([of_rates / rates**2, np.repeat(of_shapes, count)])
     swings = {}
     for name, rival in each.items():
         gap = shown.of(own) - shown.of(rival)
-        left = np.diag(told) + _left_open(others[name], rival, shown)
-        apart = gap @ np.linalg.solve(left, gap)
-        swings[name] = Swing(tuple(rival.numbers()[0].tolist()), float(np.sqrt(apart)))
+        covariance = np.diag(variances) + _left_open(others[name], rival, shown)
+        square = gap @ np.linalg.solve(covariance, gap)
+        swings[name] = Swing(tuple(rival.numbers()[0].tolist()), float(np.sqrt(square)))
     s = np.linspace(0.0, length, 101)
     shapes = np.linalg.norm(own.displacements(s)[1], axis=2)
     at = float(s[int(shapes[0].argmax())])

@@ -238,13 +238,13 @@ def estimate_noise(
     # The average along the cable is part of `correlation_length`, not of the kernel.
     smooth = best.noise.share > SMOOTH and not samples[0].correlation_length
     apart = int(cable_length / best.noise.length) if smooth else max_points
-    if apart < max_points and tell_of_noise([sample.thinned(apart) for sample in everything]):
+    thinned = [sample.thinned(apart) for sample in everything] if apart < max_points else []
+    if tell_of_noise(thinned):
         wider = estimate_noise(everything, cable_length, apart)
         if wider.length >= best.noise.length:
             return wider
         # Farther points are independent. White noise of all points would average out: the near
         # ones tell how long errors last, these how large they are.
-        thinned = [sample.thinned(apart) for sample in everything]
         size = restricted_deviance(replace(best.noise, std=1.0), thinned).std
         return replace(best.noise, std=size, slow_dof=wider.slow_dof)
     noise = replace(best.noise, slow_dof=_slow_dof(found))

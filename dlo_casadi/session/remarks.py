@@ -10,6 +10,7 @@ from dlo_casadi.equilibrium.pose import SIGNS
 from dlo_casadi.errors import counted, worded
 from dlo_casadi.estimation.fit import EXPLAINED
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.session.fitting import REST_COEFFICIENTS
 from dlo_casadi.session.found_effects import FoundEffect
 from dlo_casadi.session.outcome import SIMPLER, PoseInput, Stage
 from dlo_casadi.session.outliers import LEAST_POINTS, Outliers
@@ -183,8 +184,9 @@ def smooth_rest(fit: Fit, effects: Sequence[FoundEffect], declared: int | None) 
     names = " and ".join(effect.name for effect in effects)
     return [
         f"few places have markers, so the rest curvature has {counted(count, 'coefficient')}: one "
-        f"with more waves may look like {names}. Try: estimation.rest_curvature_coefficients: 13, "
-        f"and see whether {names} is still found"
+        f"with more waves may look like {names}. Try: "
+        f"estimation.rest_curvature_coefficients: {REST_COEFFICIENTS}, and see whether {names} is "
+        "still found"
     ]
 
 
