@@ -175,8 +175,8 @@ def smooth_rest(fit: Fit, effects: Sequence[FoundEffect], declared: int | None) 
     """That a rest curvature of few coefficients may stand behind what was found.
 
     Less than a cubic is a constant, a line or a parabola, which few places with markers allow: in
-    clean heavy cables with three markers and three waves a force or a stiff section was named, at
-    the evidence of 13 coefficients without it (check_heavy.py). `declared`: number of coefficients.
+    clean heavy cables with three markers and three waves a force or a stiff section was named, and
+    13 coefficients without it were about as likely (check_heavy.py). `declared`: their number.
     """
     count = fit.model.n_rest
     if not effects or declared is not None or not 0 < count < CUBIC:
