@@ -47,9 +47,10 @@ MESH = 40
 # Mesh on which stiffness and shapes are searched for. In space an element takes 17 times the
 # operations, so half as many are used.
 FIRST_MESH = 20
+# Of the rest curvature, whatever is measured: its roughness, which the data tell, holds what few
+# markers do not show. With as many as there are places of markers, clean heavy cables with three of
+# them had a force or a stiff section named in their place (check_heavy.py).
 REST_COEFFICIENTS = 13
-# Markers closer than this share of the cable's length count as one place.
-SAME_PLACE = 0.02
 # Share of the objective by which IPOPT's minimum may be higher and still count as the same: IPOPT
 # stops once arc lengths move by a thousandth of the noise. Largest of ten fits: 1.5e-7.
 SAME_MINIMUM = 1e-6
@@ -168,8 +169,6 @@ def fit_declared(config: Config, declared: Declared, measured: Sequence[Measured
     """
     finest, first = config.model.n, first_mesh(declared.model)
     model = declared.model.with_mesh(min(finest or first, first))
-    if config.estimation.rest_curvature_coefficients is None:
-        model = replace(model, n_rest=min(model.n_rest, carried_coefficients(model, measured)))
     measurement = config.experiment.measurement
 
     def fitted(model: CableModel) -> Fit:
@@ -207,23 +206,6 @@ def first_mesh(model: CableModel) -> int:
     """
     more = sum(kind.direction or kind.slides for kind in model.clips) + 2 * bool(model.surfaces)
     return FIRST_MESH // len(model.node.curvatures) * (2 + more) // 2
-
-
-def carried_coefficients(model: CableModel, measured: Sequence[MeasuredPose]) -> int:
-    """Number of coefficients of the rest curvature that the measurements can determine.
-
-    All poses share one rest curvature: each place with a marker gives one number per direction
-    across the cable. A clamp's heading, known within its tolerance, uses one of them, except for
-    the first two. Lines show all places; readings alone depend on all of it, and none is resolved.
-    """
-    fitted = [item for item in measured if item.has_points and not item.held_out]
-    if not fitted or not all(sensor.marked for item in fitted for sensor in item.sensors):
-        return REST_COEFFICIENTS
-    places = np.sort(np.concatenate([item.places(np.inf) for item in fitted]))
-    count = 1 + int((np.diff(places) > SAME_PLACE * places[-1]).sum())
-    # In twenty simulated cables with two to four markers a constant left structure in two, both
-    # with two markers; a linear function left none.
-    return max(min(count, 2), count - (model.start.direction + model.end.direction))
 
 
 class Minimum(NamedTuple):

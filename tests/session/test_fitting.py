@@ -16,11 +16,9 @@ from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Point
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session import run_session
 from dlo_casadi.session.fitting import (
     Minimum,
-    carried_coefficients,
     confirmed,
     declared_model,
     fit_declared,
@@ -43,31 +41,6 @@ def test_a_declared_mesh_is_kept_and_its_error_told():
     (warning,) = [text for text in outcome.warnings if "mesh" in text]
     assert f"{1e3 * outcome.mesh_error:.3g} mm" in warning
     assert "the mesh of 6 elements" in warning
-
-
-@pytest.mark.parametrize(
-    ("ends", "places", "coefficients"),
-    [
-        (("pinned", "pinned"), (0.1, 0.3, 0.5, 0.6), 4),
-        (("pinned", "pinned"), (0.1, 0.105, 0.5, 0.6), 3),  # two of them at one place
-        (("clamped", "pinned"), (0.1, 0.3, 0.5, 0.6), 3),
-        (("clamped", "clamped"), (0.1, 0.3, 0.5, 0.6), 2),
-        (("clamped", "clamped"), (0.3, 0.5), 2),
-        (("pinned", "pinned"), (0.3,), 1),
-        (("clamped", "clamped"), None, 13),  # a line
-    ],
-)
-def test_markers_tell_as_many_coefficients_of_the_rest_curvature_as_places(
-    ends, places, coefficients
-):
-    """Less the directions of the clamps, but two at least; a pose that is held out tells none."""
-    model = CableModel(CableData(0.8, 0.05, 0.008, 0.02), start=ends[0], end=ends[1])
-    s = None if places is None else np.array(places)
-    points = np.zeros((5 if s is None else len(s), 2))
-    pose = HeldPose((0.0, 0.0), (0.5, 0.0))
-    held_out = MeasuredPose.of_points(pose, np.zeros((1, 2)), s=np.array([0.7]), held_out=True)
-    measured = [MeasuredPose.of_points(pose, points, s=s), held_out]
-    assert carried_coefficients(model, measured) == coefficients
 
 
 def test_a_fit_that_ipopt_confirms_has_converged_and_one_where_it_fails_has_not():
