@@ -11,9 +11,11 @@ from typing import Any, Literal
 from dlo_casadi.diagnosis.candidates import equivalents
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.from_pose_to_pose import (
+    as_line,
     as_repeating,
     at_random,
     bends_at_random,
+    few_places,
     with_loose_poses,
 )
 from dlo_casadi.diagnosis.gram import sidak, survival
@@ -23,6 +25,7 @@ from dlo_casadi.diagnosis.selection import (
     Found,
     Ranked,
     decide,
+    likelier_by,
     ranking,
 )
 from dlo_casadi.diagnosis.structure import Structure, screening_degrees, structure_of
@@ -32,7 +35,8 @@ from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import explains
 from dlo_casadi.estimation.repeats import enough_poses
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.variances import settle
+from dlo_casadi.estimation.variances import A_LINE, settle
+from dlo_casadi.model.pose_scatter import REST_CURVATURE
 from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.runtime.work import Bound, accounted_as
 from dlo_casadi.thresholds import (
@@ -177,8 +181,15 @@ class Search:
             if found.added or not fit.errors_known:
                 force = estimate_unknown_force(found.fit, trials.executor)
         tried = {row.name for row in found.ranked}
+        wavy = (REST_CURVATURE,) if self._waves_explain_as_much(found.fit) else ()
         added = (
-            replace(x, equivalents=equivalents(found.fit, x.candidate, tried, x.rival_candidates))
+            replace(
+                x,
+                equivalents=(
+                    *equivalents(found.fit, x.candidate, tried, x.rival_candidates),
+                    *wavy,
+                ),
+            )
             for x in found.added
         )
         gram = None if found.unexplained else trials.gram_beside(found.fit)
@@ -191,6 +202,11 @@ class Search:
             if_hidden={} if gram is None else if_hidden(found.fit, gram),
             cut_off=trials.bound.met,
         )
+
+    def _waves_explain_as_much(self, fit: Fit) -> bool:
+        """Whether waves of the rest curvature explain as much as effects beside a line."""
+        line = fit.problem.priors.roughness_std <= A_LINE
+        return line and likelier_by(self.declared, fit) < EVIDENCE_APART
 
     def _random_is_better(self, found: Found, near: Fit) -> bool:
         """Whether effects that were found in a misfit are no better than a random difference.
@@ -298,6 +314,17 @@ def _repeating(search: Search, _: Found | None = None) -> Search:
     return search.beginning_with(declared=as_repeating(search.declared))
 
 
+def _waves_may_hide_one(search: Search, found: Found) -> bool:
+    """Whether waves of the rest curvature, which few markers tell from no effect, gain enough."""
+    if found.added or not few_places(search.declared):
+        return False
+    return likelier_by(_on_a_line(search).declared, found.fit) > EVIDENCE_APART
+
+
+def _on_a_line(search: Search, _: Found | None = None) -> Search:
+    return search.beginning_with(declared=as_line(search.declared))
+
+
 def _noise_is_smaller(search: Search, found: Found) -> bool:
     """Whether scores may be significant under the noise of a complete model.
 
@@ -336,6 +363,7 @@ NEAR = (
     Beginning(lambda _, found: found.unexplained or not found.added, lambda search, _: search),
     Beginning(_noise_is_smaller, _under_its_noise),
     Beginning(_as_if_repeating, _repeating, EVIDENCE_APART),
+    Beginning(_waves_may_hide_one, _on_a_line),
 )
 CAUSES = Beginning(
     lambda search, found: (

@@ -3,6 +3,8 @@
 from contextlib import suppress
 from dataclasses import replace
 
+import numpy as np
+
 from dlo_casadi.diagnosis.from_data import COMPARED, NEAR_NOISE, expected_left
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import descend
@@ -11,7 +13,7 @@ from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.start import fit_from, relaxed
 from dlo_casadi.estimation.unknowns import Values
-from dlo_casadi.estimation.variances import pose_scatter_of, refine
+from dlo_casadi.estimation.variances import A_LINE, pose_scatter_of, refine
 from dlo_casadi.model.pose_scatter import PoseScatter, sources_in
 from dlo_casadi.runtime.work import accounted_as
 
@@ -19,11 +21,33 @@ from dlo_casadi.runtime.work import accounted_as
 # length; of a clamp's turns [rad]; of the curvature by a pin's moment, in 1 / length. A judgement:
 # a setup in which they differ more is a broken one.
 LOOSE_PLACE, LOOSE_TURN, LOOSE_BEND = 0.02, 0.1, 1.0
+# Most places of few markers, and the share of the length within which two count as one: a clamp and
+# four of them tell a cubic, which has two numbers more than a line.
+FEW, MARKERS_APART = 4, 0.02
 
 
 def as_repeating(fit: Fit) -> Fit:
     """Refit as if nothing differed at random from pose to pose, with the noise as it is."""
     return descend(fit.reweighed(priors=replace(fit.problem.priors, pose_scatter=PoseScatter())))
+
+
+def as_line(fit: Fit) -> Fit:
+    """Refit with a rest curvature that is held to a line along the cable."""
+    priors = replace(fit.problem.priors, roughness_std=A_LINE)
+    return descend(fit.reweighed(priors=priors))
+
+
+def few_places(fit: Fit) -> bool:
+    """Whether markers show shapes at so few places that an effect looks like a wavy rest shape.
+
+    Of a rest curvature they then tell hardly more numbers beside a line than an effect has.
+    """
+    items = fit.problem.fit_poses
+    if not fit.has_points or not all(x.marked for item in items for x in item.sensors):
+        return False
+    length = fit.model.cable.length
+    places = np.sort(np.concatenate([item.places(length) for item in items]))
+    return 1 + int((np.diff(places) > MARKERS_APART * length).sum()) <= FEW
 
 
 def bends_at_random(fit: Fit) -> bool:

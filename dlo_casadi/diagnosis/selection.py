@@ -84,6 +84,8 @@ class Found:
         All candidates of the first step: the refitted ones by `support`, then the others by score.
     unexplained : bool
         Whether structure is left, or most left-out poses are not predicted.
+    as_likely : tuple of str
+        If no effect was added: those of another search, which explain the data as well.
     """
 
     fit: Fit
@@ -92,6 +94,7 @@ class Found:
     validation: CrossValidation
     structure: Structure
     unexplained: bool
+    as_likely: tuple[str, ...]
 
     @staticmethod
     def of(
@@ -105,7 +108,7 @@ class Found:
         unpredicted = told and validation.error_of_most > limit
         unexplained = structure.p_noise < significance or unpredicted
         unexplained |= fit.noise.source == "misfit"
-        return Found(fit, tuple(added), ranked, validation, structure, unexplained)
+        return Found(fit, tuple(added), ranked, validation, structure, unexplained, ())
 
     def or_better(self, other: Self | None, margin: float = 0.0) -> Self:
         """The other search's result if only that explains the data, or better; else this one.
@@ -117,12 +120,14 @@ class Found:
         candidates = max(len(self.ranked), len(other.ranked))
         if self.unexplained == other.unexplained:
             likelier = likelier_by(self.fit, other.fit) - other._sets(candidates)
-            better = likelier + self._sets(candidates) > margin
+            likelier += self._sets(candidates)
+            better = likelier > margin
         else:
-            better = self.unexplained
+            likelier, better = -np.inf, self.unexplained
         if not better:
-            return self
-        names = " and ".join(item.candidate.name for item in other.added) or "no effect"
+            tied = likelier > -EVIDENCE_APART and not (self.added or self.unexplained)
+            return replace(self, as_likely=other.names) if tied and other.added else self
+        names = " and ".join(other.names) or "no effect"
         known = {item.name for item in other.ranked}
         chosen = {x.name for item in self.added for x in (item.candidate, *item.rival_candidates)}
         rest = (
@@ -131,6 +136,11 @@ class Found:
             if x.name not in known
         )
         return replace(other, ranked=(*other.ranked, *rest))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the effects that were added."""
+        return tuple(item.name for item in self.added)
 
     def leaves_little(self, validation: CrossValidation) -> bool:
         """Whether its effects explain nearly all of what the declared model lacks.

@@ -33,7 +33,8 @@ SETTLED_MODES = 2
 FIRST_FORCE = 0.01
 # Minimum number of degrees of freedom to estimate the size of the noise.
 LEAST_SPARE = 3.0
-ROUGHNESS_FLOOR = 1e-3
+# Least roughness that is estimated, and the one of a rest curvature that is held to a line.
+ROUGHNESS_FLOOR, A_LINE = 1e-3, 1e-4
 # Smallest scatter of the poses' ends, as a share of the tolerance.
 SCATTER_FLOOR = 0.05
 
@@ -330,9 +331,9 @@ def _noise_samples(fit: Fit, modes: int) -> list[NoiseSample]:
 
 
 def roughness_of(fit: Fit) -> float:
-    """One fixed-point update of the roughness of the rest curvature."""
+    """One fixed-point update of the roughness of the rest curvature; A_LINE stays one."""
     unknowns, roughness_std = fit.problem.unknowns, fit.problem.priors.roughness_std
-    if unknowns.n_rest < 3:
+    if unknowns.n_rest < 3 or roughness_std <= A_LINE:
         return roughness_std
     rest = slice(unknowns.n_parameters, unknowns.size)
     rough = unknowns.model.roughness

@@ -337,6 +337,8 @@ class Outcome:
         Of all predicted poses, where the session declares limits.
     cut_off : bool
         Whether the diagnosis has met the bound on its work before everything was tried.
+    as_likely : tuple of str
+        If no effect was added: those that explain what was measured as well.
     motion_scores : dict
         Score of each effect that only motion shows, see `search_in_motion`.
     modes : MeasuredModes, optional
@@ -367,6 +369,7 @@ class Outcome:
     limits: tuple[LimitCheck, ...] = ()
     versions: dict[str, str] = field(default_factory=dict)
     cut_off: bool = False
+    as_likely: tuple[str, ...] = ()
     motion_scores: Mapping[str, float] = field(default_factory=dict)
     modes: MeasuredModes | None = None
     work: Part = field(default_factory=Part)

@@ -7,18 +7,14 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config import SkippedPose
 from dlo_casadi.equilibrium.pose import SIGNS
-from dlo_casadi.errors import counted, worded
+from dlo_casadi.errors import worded
 from dlo_casadi.estimation.fit import EXPLAINED
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.session.fitting import REST_COEFFICIENTS
-from dlo_casadi.session.found_effects import FoundEffect
 from dlo_casadi.session.outcome import SIMPLER, PoseInput, Stage
 from dlo_casadi.session.outliers import LEAST_POINTS, Outliers
 from dlo_casadi.session.pose_shape import BranchShape, PoseShape
 from dlo_casadi.thresholds import BEYOND_CHANCE, UNSEEN
 
-# Coefficients of a cubic spline, at least.
-CUBIC = 4
 CUT_OFF = (
     "the diagnosis has met the bound on its work before everything was tried, as where several "
     "things are missing that hide each other: the verdict is about what was found until then. Try: "
@@ -171,22 +167,14 @@ def worse_than_simpler(stages: Sequence[Stage]) -> list[str]:
     ]
 
 
-def smooth_rest(fit: Fit, effects: Sequence[FoundEffect], declared: int | None) -> list[str]:
-    """That a rest curvature of few coefficients may stand behind what was found.
-
-    Less than a cubic is a constant, a line or a parabola, which few places with markers allow: in
-    clean heavy cables with three markers and three waves a force or a stiff section was named, and
-    13 coefficients without it were about as likely (check_heavy.py). `declared`: their number.
-    """
-    count = fit.model.n_rest
-    if not effects or declared is not None or not 0 < count < CUBIC:
+def as_likely(names: Sequence[str]) -> list[str]:
+    """That effects explain what was measured as well as the complete model does."""
+    if not names:
         return []
-    names = " and ".join(effect.name for effect in effects)
     return [
-        f"few places have markers, so the rest curvature has {counted(count, 'coefficient')}: one "
-        f"with more waves may look like {names}. Try: "
-        f"estimation.rest_curvature_coefficients: {REST_COEFFICIENTS}, and see whether {names} is "
-        "still found"
+        f"{' and '.join(names)} would explain what was measured as well as waves of the rest "
+        "curvature, or differences from pose to pose, do alone: the data do not tell them apart. "
+        "Try: markers at more places, lines, more poses"
     ]
 
 

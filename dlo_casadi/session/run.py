@@ -267,6 +267,7 @@ class _Run:
             "cross_validated": validated.rmse if told else None,
             "if_hidden": diagnosis.if_hidden,
             "cut_off": diagnosis.cut_off,
+            "as_likely": diagnosis.as_likely,
         }
         return fit, found, diagnosis.added
 
@@ -342,9 +343,8 @@ def judged(outcome: Outcome) -> Outcome:
     poses = () if outcome.config.estimation.robust else outcome.poses
     said = fit_warnings(fit, outcome.mesh_error, declared, poses)
     said += remarks.worse_than_simpler(stages)
-    coefficients = outcome.config.estimation.rest_curvature_coefficients
-    said += remarks.smooth_rest(fit, outcome.effects, coefficients)
     said += [remarks.CUT_OFF] if outcome.cut_off else []
+    said += remarks.as_likely(outcome.as_likely)
     if fit.model.cable.straight and outcome.config.cable.rest_shape == "curved":
         said.append(remarks.TAKEN_AS_STRAIGHT)
     told = (*doubts, *remarks.branch_warnings(stages))

@@ -115,7 +115,7 @@ def result(evidence, *added, unexplained=False):
         SimpleNamespace(candidate=SimpleNamespace(name=name), rival_candidates=[]) for name in added
     )
     ranked = tuple(Ranked(f"c{k}", 1.0, 1.0, None) for k in range(10))
-    return Found(fit, effects, ranked, None, None, unexplained)
+    return Found(fit, effects, ranked, None, None, unexplained, ())
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 
 import dlo_casadi as dlo
 from dlo_casadi.report.tables import outcome_text
@@ -12,7 +11,7 @@ from dlo_casadi.session import plausibility
 from dlo_casadi.session.measure import read_inputs
 from dlo_casadi.session.outcome import Stage
 from dlo_casadi.session.questions import Suspicion
-from dlo_casadi.session.remarks import far_off, smooth_rest
+from dlo_casadi.session.remarks import as_likely, far_off
 
 PINS = ("pinned", "pinned")
 
@@ -85,17 +84,6 @@ def test_gravity_upside_down_is_refused_of_eight_poses_as_of_five():
         assert item.certain, item.message
 
 
-@pytest.mark.parametrize(
-    ("count", "declared", "said"),
-    [(2, None, True), (3, None, True), (4, None, False), (2, 2, False)],
-)
-def test_an_effect_beside_a_rest_curvature_of_few_coefficients_is_doubted(count, declared, said):
-    fit = SimpleNamespace(model=SimpleNamespace(n_rest=count))
-    found = smooth_rest(fit, [SimpleNamespace(name="point_force")], declared)
-    assert len(found) == said
-    assert not smooth_rest(fit, [], declared)
-    if said:
-        assert (
-            f"has {count} coefficients: one with more waves may look like point_force" in found[0]
-        )
-        assert "estimation.rest_curvature_coefficients: 13" in found[0]
+def test_effects_that_are_as_likely_as_none_are_told():
+    assert not as_likely(())
+    assert "clamp_angle would explain what was measured as well" in as_likely(("clamp_angle",))[0]
