@@ -9,7 +9,7 @@ from typing import Self
 import numpy as np
 
 from dlo_casadi.diagnosis.candidates import Candidate
-from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
+from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate, density_of_declared
 from dlo_casadi.diagnosis.gram import Screened, sidak, survival
 from dlo_casadi.diagnosis.refits import Confirmed, Tried
 from dlo_casadi.diagnosis.structure import Structure, noise_degrees, structure_of
@@ -335,12 +335,14 @@ def support(item: Confirmed, base: Fit, validation: CrossValidation) -> float:
     """Log of how much likelier a refit makes the data than its base: a mean of two measures.
 
     The two are the gains in marginal likelihood and in the predictive density of left-out poses
-    (`validation` is that of the base). They agree if nothing else is missing. A wrong effect
+    (`validation` is that of the base) and of the values declared for the base's nuisances. They agree if nothing else is missing. A wrong effect
     adapts to the fitted data but predicts left-out data badly. The mean is harmonic, so the
     smaller gain decides; if that is not positive, it is returned alone.
     """
     one = item.fit.log_evidence - base.log_evidence
-    other = item.validation.log_density - validation.log_density
+    held = base.model.priors
+    declared = density_of_declared(item.fit, held) - density_of_declared(base, held) if held else 0
+    other = item.validation.log_density - validation.log_density + declared
     smaller = min(one, other)
     return smaller if smaller <= 0 else 2 * one * other / (one + other)
 

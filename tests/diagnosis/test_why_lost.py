@@ -12,7 +12,7 @@ from dlo_casadi.diagnosis.refits import Confirmed
 from dlo_casadi.diagnosis.selection import Found, Ranked, choose, support
 
 COUNTS = np.full(6, 40.0)
-BASE = SimpleNamespace(log_evidence=100.0)
+BASE = SimpleNamespace(log_evidence=100.0, model=SimpleNamespace(priors={}))
 # What each pose gains of a gain in all.
 SHARES = np.array([0.9, 1.1, 1.0, 0.95, 1.05, 1.0]) / 6
 
