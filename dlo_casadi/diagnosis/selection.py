@@ -335,9 +335,10 @@ def support(item: Confirmed, base: Fit, validation: CrossValidation) -> float:
     """Log of how much likelier a refit makes the data than its base: a mean of two measures.
 
     The two are the gains in marginal likelihood and in the predictive density of left-out poses
-    (`validation` is that of the base) and of the values declared for the base's nuisances. They agree if nothing else is missing. A wrong effect
-    adapts to the fitted data but predicts left-out data badly. The mean is harmonic, so the
-    smaller gain decides; if that is not positive, it is returned alone.
+    (`validation` is that of the base) and of the values declared for the base's nuisances. They
+    agree if nothing else is missing. A wrong effect adapts to the fitted data but predicts left-out
+    data badly. The mean is harmonic, so the smaller gain decides; if that is not positive, it is
+    returned alone.
     """
     one = item.fit.log_evidence - base.log_evidence
     held = base.model.priors

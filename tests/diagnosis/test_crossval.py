@@ -1,12 +1,14 @@
 """Left-out poses where one Gauss-Newton step leads too far."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from dlo_casadi.diagnosis import crossval
-from dlo_casadi.diagnosis.crossval import cross_validate
+from dlo_casadi.diagnosis.crossval import cross_validate, density_of_declared
 from dlo_casadi.effects import CableData, RestCurvatureDrift
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
@@ -146,3 +148,22 @@ def test_a_pose_that_newtons_method_loses_counts_for_no_error(monkeypatch):
     found = cross_validate(fit)
     assert np.isinf(found.squares[2])
     assert found.error_of_most < 1.2 * expected.error
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_a_declared_value_is_left_out_as_a_measurement_is(held):
+    """Poses tell v = 3 with a variance of 0.5; declared is 0 with a tolerance of 2, or nothing."""
+    told, variance, tolerance, scale = 3.0, 0.5, 2.0, 10.0
+    own = 1 / (1 / variance + 1 / tolerance**2) if held else variance
+    v = told * own / variance if held else told
+    unknowns = SimpleNamespace(names=("other", "v"), scales=np.array([1.0, scale]))
+    fit = SimpleNamespace(
+        problem=SimpleNamespace(unknowns=unknowns, mean=np.zeros(2)),
+        point=SimpleNamespace(theta=np.array([7.0, v / scale])),
+        covariance=np.diag([1.0, own / scale**2]),
+        model=SimpleNamespace(priors={"v": tolerance} if held else {}),
+    )
+    width = tolerance if held else scale
+    expected = norm(told, np.sqrt(width**2 + variance)).logpdf(0.0)
+    constant = norm.logpdf(0.0) - np.log(scale)
+    assert density_of_declared(fit, ["v"]) == pytest.approx(expected - constant)

@@ -58,5 +58,6 @@ def test_only_a_clear_gain_counts_where_poses_do_not_repeat(gains, doubt, kept):
     added = SimpleNamespace(candidate=SimpleNamespace(name="effect"))
     after = CrossValidation(counts, counts, 1.0, densities=np.array(gains))
     tried = Confirmed(added, SimpleNamespace(log_evidence=100.0), after, 100.0)
-    chosen, _ = choose([tried], SimpleNamespace(log_evidence=0.0), before, doubt)
+    base = SimpleNamespace(log_evidence=0.0, model=SimpleNamespace(priors={}))
+    chosen, _ = choose([tried], base, before, doubt)
     assert chosen == ([tried] if kept else [])

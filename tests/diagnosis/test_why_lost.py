@@ -112,7 +112,8 @@ def result(evidence, *added, unexplained=False):
     model, noise = SimpleNamespace(n=10), SimpleNamespace(source="declared")
     fit = SimpleNamespace(log_evidence=evidence, model=model, noise=noise)
     effects = tuple(
-        SimpleNamespace(candidate=SimpleNamespace(name=name), rival_candidates=[]) for name in added
+        SimpleNamespace(name=name, candidate=SimpleNamespace(name=name), rival_candidates=[])
+        for name in added
     )
     ranked = tuple(Ranked(f"c{k}", 1.0, 1.0, None) for k in range(10))
     return Found(fit, effects, ranked, None, None, unexplained, ())
