@@ -151,6 +151,8 @@ def errors_of(
                 break
         else:
             noise, together = _white_noise(fit), True
+        least = max(item.least for item in fit.problem.fit_poses)
+        noise = replace(noise, std=max(noise.std, least))
     noise = replace(noise, readings=reading_noise_of(fit))
     if repeats:
         return noise, PoseScatter()

@@ -40,12 +40,15 @@ class MeasuredPose:
         Measured points of the cable used to report distances, if they are not those of the
         sensors: the common line of photographs, without points if there is none; or all points if
         the sensors have means of them.
+    least : float [m]
+        Standard deviation below which no noise is estimated: what a photograph's pixels leave.
     """
 
     pose: HeldPose
     sensors: tuple[Sensor, ...] = ()
     held_out: bool = False
     line: Centerline | Markers | None = None
+    least: float = 0.0
 
     @classmethod
     def of_points(

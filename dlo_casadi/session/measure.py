@@ -25,6 +25,9 @@ THREADS = 2
 MOST_POINTS = 240
 # Distance [m] within which a point repeats the number of a fixture: the digits of a printed file.
 COPIED = 1e-6
+# Least noise of a line's points, in pixels of its photograph, however little they scatter: what
+# pictures of an independent renderer leave. See docs/pages/theory/noise.md.
+LEAST_PIXELS = 0.02
 
 
 def read_session(config: Config, step: Step = nobody) -> tuple[Config, tuple[PoseInput, ...]]:
@@ -104,6 +107,8 @@ def _measured(pose: Pose, item: PoseInput, std: float, config: Config) -> Measur
         seen = MeasuredPose(held, (means,), held_out, line_or_markers(item.points, s=item.s))
     else:
         seen = MeasuredPose.of_points(held, item.points, item.weight, held_out, item.s)
+    if item.pixel is not None:
+        seen = replace(seen, least=LEAST_PIXELS * item.pixel)
     if config.experiment.fed_by_length and held.free_length is None:
         seen = seen.fed_as_seen(config.cable.length, config.experiment.boundary.fed)
     return seen.with_readings(pose.readings) if item.readable else seen

@@ -1,5 +1,7 @@
 """Lines and markers of more points than a fit compares one by one."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -13,7 +15,7 @@ from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.session.fitting import declared_model, fit_declared
-from dlo_casadi.session.measure import MOST_POINTS, measured_poses, read_inputs
+from dlo_casadi.session.measure import LEAST_PIXELS, MOST_POINTS, measured_poses, read_inputs
 from dlo_casadi.session.stages import fit_stage
 
 STD, MANY = 3e-4, 2000
@@ -107,3 +109,14 @@ def test_means_leave_gaps_alone_and_average_white_noise_only():
     many = noise.covariance(place, one, count=np.array([1e6]))
     assert many[0, 0] == pytest.approx(0.5 * STD**2, rel=1e-5)
     assert noise.covariance(place, one)[0, 0] == pytest.approx(STD**2)
+
+
+def test_no_noise_is_estimated_below_what_the_pixels_of_a_photograph_leave(tmp_path):
+    """Points that scatter by 0.3 mm, as if from photographs with pixels of 1 mm, or of 30 mm."""
+    config, _ = session(tmp_path, 60, False, None)
+    found = []
+    for pixel in (1e-3, 30e-3):
+        inputs = [replace(item, pixel=pixel) for item in read_inputs(config)]
+        found.append(fit_of(config, measured_poses(config, inputs)).noise.std)
+    assert found[0] == pytest.approx(STD, rel=0.2)
+    assert found[1] == LEAST_PIXELS * 30e-3
