@@ -63,8 +63,9 @@ from dlo_casadi.tracking.seen import OUTLIER
 FIRST_SEEN = FIRST_STRETCHES[-1]
 # Rows of the fixtures that are kept.
 _ROWS = 8
-# Steps of time in one of a fit, whose points are extrapolated to steps of no length.
-_FINER = 4
+# Steps of time in the longest one of a fit, and in the one that its period allows: a fit's points
+# are extrapolated to steps of no length.
+_FINER, _OF_PERIOD = 4, 2
 # Smallest standard deviation of a fixture [m, rad]: none is exact.
 _EXACT = 1e-9
 
@@ -182,7 +183,7 @@ class InMotion:
         root = block_diag(np.hstack([shared, loose]), np.diag(recording.own_std(model)))
         root = np.vstack([root, np.pad(shared, ((0, 0), (0, root.shape[1] - shared.shape[1])))])
         root = root[:, np.abs(root).max(axis=0) > 0]
-        longest = min(LONGEST_STEP, recording.period / IN_A_PERIOD) / _FINER
+        longest = min(LONGEST_STEP / _FINER, recording.period / IN_A_PERIOD / _OF_PERIOD)
         begun = cls(
             known,
             moving,
