@@ -46,12 +46,14 @@ class Case(NamedTuple):
 class Row(NamedTuple):
     """What was hidden and found, whether EI and tau are inside, held-out error over noise.
 
-    `shown`: of a missed effect, the root of its score (`motion_scores`). `told`: by rivals among
-    the still shapes, the log evidence against them without and with the motions.
+    `tied`: names that the session cannot tell from what was found. `shown`: of a missed effect, the
+    root of its score (`motion_scores`). `told`: by rivals among the still shapes, the log evidence
+    against them without and with the motions.
     """
 
     hidden: str
     found: tuple[str, ...]
+    tied: tuple[str, ...]
     stiffness_inside: bool
     damping_inside: bool
     held_out: float
@@ -60,19 +62,24 @@ class Row(NamedTuple):
     seconds: float
 
     @property
+    def named(self) -> bool:
+        """Whether what is hidden was found, alone or tied with what was found."""
+        return self.hidden in self.found or self.hidden in self.tied
+
+    @property
     def right(self) -> bool:
-        """Whether exactly what was hidden was found."""
-        return self.found == ((self.hidden,) if self.hidden else ())
+        """Whether exactly what was hidden was found, or one thing that is tied with it."""
+        return len(self.found) == 1 and self.named if self.hidden else not self.found
 
     @property
     def wrong(self) -> bool:
-        """Whether something is named that is not there."""
-        return bool(set(self.found) - {self.hidden})
+        """Whether something is named that is not there, nor tied with what is."""
+        return not self.right and bool(set(self.found) - {self.hidden})
 
     @property
     def shows(self) -> bool:
         """Whether something hidden can be seen."""
-        return bool(self.hidden) and (self.hidden in self.found or self.shown > SHOWN)
+        return bool(self.hidden) and (self.named or self.shown > SHOWN)
 
 
 def truth(
@@ -162,12 +169,14 @@ def work(case: Case) -> Row:
     if name and name not in names:  # twice what it gains of the log likelihood, to first order
         shown = float(np.sqrt(found.motion_scores.get(name, 0.0)))
     told = {key: both for effect in found.effects for key, both in effect.told_apart.items()}
-    return Row(name, names, *inside, ratio, shown, told, seconds)
+    tied = tuple(x for effect in found.effects for x in effect.indistinguishable_from)
+    return Row(name, names, tied, *inside, ratio, shown, told, seconds)
 
 
 def line(case: Case, row: Row, seconds: float) -> str:
     """One line of the table."""
     found = ", ".join(row.found) or "nothing"
+    found += f" (tied with {', '.join(row.tied)})" if row.tied else ""
     if np.isfinite(row.shown):
         found += f" (it shows by {row.shown:.1f} std)"
     for name, (still, moving) in row.told.items():

@@ -288,23 +288,29 @@ def _best(
         for one in order
         if one.value > max(2 * ENOUGH * _price(one.candidate, level), NEAR * order[0].value)
     ]
-    fitted: list[tuple[float, Candidate, MotionFit]] = []
+    fitted: list[tuple[float, float, float, Candidate, MotionFit]] = []
     for one in likely[:REFITTED]:
         item, model = one.candidate, one.candidate.add_to(start.fit.model)
         try:
             trial = rejoined(start, model, one.values)
         except EstimationError:
             continue
-        gain = (now.objective - trial.objective) / _excess(trial, item)
-        gain = min(gain, _square(trial, item) / 2)
-        fitted.append((gain - _price(item, level), item, trial))
-    if not fitted:
+        whole, excess = now.objective - trial.objective, _excess(trial, item)
+        gain = min(whole / excess, _square(trial, item) / 2)
+        fitted.append((whole, excess, gain, item, trial))
+    significant = [k for k, (*_, gain, item, _) in enumerate(fitted) if gain > _price(item, level)]
+    if not significant:
         return None
-    net, item, trial = max(fitted, key=lambda x: x[0])
-    if net <= 0:
-        return None
-    rivals = tuple(x.name for gain, x, _ in fitted if x is not item and gain > net - EVIDENCE_APART)
-    gain = net + _price(item, level)
+    # Candidates are compared at one excess: each one's own would decide between like ones.
+    common = max(excess for _, excess, *_ in fitted)
+    net = [whole / common - _price(item, level) for whole, *_, item, _ in fitted]
+    chosen = max(significant, key=net.__getitem__)
+    *_, gain, item, trial = fitted[chosen]
+    rivals = tuple(
+        other[3].name
+        for k, other in enumerate(fitted)
+        if k != chosen and net[k] > net[chosen] - EVIDENCE_APART
+    )
     p_value = sidak(survival(2 * gain, len(item.frees), np.inf), tried)
     return trial, AddedInMotion(item, gain, p_value, rivals, now.rmse, trial.rmse)
 
