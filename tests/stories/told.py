@@ -121,6 +121,10 @@ class Story:
         assert refitted <= chosen | lost
         assert not chosen & lost
 
+    def line(self, name: str) -> np.ndarray:
+        """Points (K, d) [m] of a pose's centre-line, as they were written."""
+        return np.loadtxt(self.results / "centerlines" / f"{name}.csv", delimiter=",", skiprows=1)
+
     def pose(self, name: str) -> dict:
         """What the configuration says of a pose."""
         poses = self.session["experiment"]["poses"]
