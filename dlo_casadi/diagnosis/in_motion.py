@@ -301,8 +301,9 @@ def _best(
     significant = [k for k, (*_, gain, item, _) in enumerate(fitted) if gain > _price(item, level)]
     if not significant:
         return None
-    # Candidates are compared at one excess: each one's own would decide between like ones.
-    common = max(excess for _, excess, *_ in fitted)
+    # Candidates are compared at one excess, of what the best fit leaves: that of another one has
+    # what it misses, too, and each one's own would decide between like ones.
+    common = max(fitted, key=lambda x: x[0])[1]
     net = [whole / common - _price(item, level) for whole, *_, item, _ in fitted]
     chosen = max(significant, key=net.__getitem__)
     *_, gain, item, trial = fitted[chosen]

@@ -12,6 +12,7 @@ from dlo_casadi.diagnosis import in_motion
     [
         ({"air": 3.1, "liquid": 2.6}, {"air": 122.0, "liquid": 130.0}, "air", ("liquid",)),
         ({"air": 2.6, "liquid": 2.6}, {"air": 1.0, "liquid": 130.0}, "liquid", ("air",)),
+        ({"air": 0.1, "liquid": 9.9}, {"air": 122.0, "liquid": 130.0}, "air", ()),
         ({"air": 2.6, "liquid": 2.6}, {"air": 1.0, "liquid": 1.0}, None, ()),
     ],
 )
