@@ -1,6 +1,6 @@
 """Simulated heavy cables that do not repeat: what is predicted of tips that were left out.
 
-    python scripts/check_heavy.py [--count 20] [--first 0] [--seed 0]
+    python scripts/check_heavy.py [--count 20] [--first 0] [--seed 0] [--jobs N]
 
 A gripper holds the start, the tip is free; 25 poses of three markers or two, each 2 to 4 mm off as
 declared; each pose has a rest curvature of its own of 0.05 to 0.3 1/m, the clamp is known to
@@ -53,7 +53,7 @@ class Row(NamedTuple):
 
     @property
     def right(self) -> bool:
-        """Whether tips and scatter are as they should be, and nothing is named that is not so."""
+        """Whether tips and scatter are as they should be, and only what is hidden is named."""
         alike = 1 / FACTOR <= self.estimated / self.scatter <= FACTOR
         return alike and self.tips <= MOST * self.left and set(self.found) <= set(self.hidden)
 
@@ -161,13 +161,7 @@ def main() -> int:
     parser = options(__doc__, count=(20, "cables"), first=True, seed=0, jobs=True, output=True)
     args = parser.parse_args()
     cases = range(args.first, args.first + args.count)
-    rows = run(
-        partial(work, seed=args.seed),
-        cases,
-        args,
-        line,
-        summary=summary,
-    )
+    rows = run(partial(work, seed=args.seed), cases, args, line, summary=summary)
     return int(not all(row.right for row in rows))
 
 

@@ -2,9 +2,9 @@
 
     python scripts/check_rates.py [--seed 1] [--jobs N]
 
-A rope of 0.6 m is clamped at its start, pulled 0.3 m aside at its tip and let go; four shapes at
-rest lie beside it. Simulated on a mesh twice as fine as that of the fit. Each line is one
-recording; exit code 1 if damping or EI is more than three standard deviations off.
+A rope of 0.6 m is clamped at its start; its tip is pulled to PULLED, 0.35 m aside, and let go. Four
+shapes at rest are measured, too. All are simulated on a mesh twice as fine as that of the fit. Each
+line is one recording; exit code 1 if damping or EI is more than three standard deviations off.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ Vehtari, Gelman and Gabry, Practical Bayesian model evaluation, Statistics and C
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
@@ -175,7 +175,7 @@ def cross_validate(fit: Fit) -> CrossValidation:
     return replace(found, expected=expected, densities=np.array(densities))
 
 
-def density_of_declared(fit: Fit, names: Iterable[str]) -> float:
+def density_of_declared(fit: Fit, names: Container[str]) -> float:
     """Log predictive density of values declared for nuisances, each left out, up to a constant.
 
     A tolerance t is a measurement of a nuisance v, as poses are: with the variance S that v has,

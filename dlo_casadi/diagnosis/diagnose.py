@@ -315,7 +315,7 @@ def _repeating(search: Search, _: Found | None = None) -> Search:
 
 
 def _waves_may_hide_one(search: Search, found: Found) -> bool:
-    """Whether waves of the rest curvature, which few markers tell from no effect, gain enough."""
+    """Whether few markers leave open if an effect or waves of the rest curvature are the cause."""
     if found.added or not few_places(search.declared):
         return False
     return likelier_by(_on_a_line(search).declared, found.fit) > EVIDENCE_APART

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
@@ -271,6 +272,17 @@ def _square(fit: MotionFit, item: Candidate) -> float:
     return max((size**2 for size in sizes), default=0.0)
 
 
+class _Refit(NamedTuple):
+    """A candidate's fit: what it gains, its `_excess`, its gain as counted, and its `_price`."""
+
+    candidate: Candidate
+    fit: MotionFit
+    whole: float
+    excess: float
+    gain: float
+    price: float
+
+
 def _best(
     start: MotionFit,
     now: MotionFit,
@@ -288,7 +300,7 @@ def _best(
         for one in order
         if one.value > max(2 * ENOUGH * _price(one.candidate, level), NEAR * order[0].value)
     ]
-    fitted: list[tuple[float, float, float, Candidate, MotionFit]] = []
+    fitted: list[_Refit] = []
     for one in likely[:REFITTED]:
         item, model = one.candidate, one.candidate.add_to(start.fit.model)
         try:
@@ -297,23 +309,22 @@ def _best(
             continue
         whole, excess = now.objective - trial.objective, _excess(trial, item)
         gain = min(whole / excess, _square(trial, item) / 2)
-        fitted.append((whole, excess, gain, item, trial))
-    significant = [k for k, (*_, gain, item, _) in enumerate(fitted) if gain > _price(item, level)]
+        fitted.append(_Refit(item, trial, whole, excess, gain, _price(item, level)))
+    significant = [x for x in fitted if x.gain > x.price]
     if not significant:
         return None
     # Candidates are compared at one excess, of what the best fit leaves: that of another one has
     # what it misses, too, and each one's own would decide between like ones.
-    common = max(fitted, key=lambda x: x[0])[1]
-    net = [whole / common - _price(item, level) for whole, *_, item, _ in fitted]
-    chosen = max(significant, key=net.__getitem__)
-    *_, gain, item, trial = fitted[chosen]
-    rivals = tuple(
-        other[3].name
-        for k, other in enumerate(fitted)
-        if k != chosen and net[k] > net[chosen] - EVIDENCE_APART
-    )
-    p_value = sidak(survival(2 * gain, len(item.frees), np.inf), tried)
-    return trial, AddedInMotion(item, gain, p_value, rivals, now.rmse, trial.rmse)
+    common = max(fitted, key=lambda x: x.whole).excess
+
+    def net(x: _Refit) -> float:
+        return x.whole / common - x.price
+
+    best = max(significant, key=net)
+    near = [x for x in fitted if x is not best and net(x) > net(best) - EVIDENCE_APART]
+    rivals, item = tuple(x.candidate.name for x in near), best.candidate
+    p_value = sidak(survival(2 * best.gain, len(item.frees), np.inf), tried)
+    return best.fit, AddedInMotion(item, best.gain, p_value, rivals, now.rmse, best.fit.rmse)
 
 
 def _price(item: Candidate, level: float) -> float:

@@ -119,7 +119,8 @@ def errors_of(
 
     The noise is estimated with all changes of shape projected out. If lines have too few points
     for that, fewer slow displacements are projected out; in the last resort the noise is white,
-    and its size is estimated together with that of the rest curvatures.
+    and its size is estimated together with that of the rest curvatures. It is never smaller than
+    the `least` of the poses.
 
     Parameters
     ----------

@@ -60,7 +60,7 @@ def test_a_wavy_rest_curvature_seen_at_three_places_is_no_effect():
 
 @pytest.mark.parametrize(("off", "names"), [(0.2, ()), (0.3, ("clamp_angle",))])
 def test_a_clamp_that_turned_is_tied_with_waves_of_the_rest_curvature(off, names):
-    """The likelier of both is reported, and the other one told; 0.4 rad off it is the clamp."""
+    """The likelier of both is reported, and the other one is told."""
     found = diagnose(fitted(off=off))
     assert found.names == names
     if not names:
