@@ -12,7 +12,9 @@ divided by c = m' J m / m' H m, with the variance J of the gradient (`told_by`) 
 all unknowns along the candidate, and no more than the square of the effect's size in standard
 deviations, with what motions and still poses may differ by. The best one is added if it is
 significant, as in the search among still poses, until none is. No misfit is asked for: an effect of
-six standard deviations leaves a thousand residuals at 1.02 times their noise.
+six standard deviations leaves a thousand residuals at 1.02 times their noise. Then each of the
+others is left out once, those that still poses have shown, too: one that loses less than it would
+have to gain is dropped. A weight looks like a taper at rest, and swings like a weight.
 """
 
 from __future__ import annotations
@@ -87,12 +89,15 @@ class InMotion:
         Without and with the added effects.
     scores : dict
         By name, the score of each candidate in the first round.
+    dropped : tuple of Candidate
+        Of those that still poses had shown, what the added ones have made superfluous.
     """
 
     before: MotionFit
     after: MotionFit
     added: tuple[AddedInMotion, ...]
     scores: dict[str, float]
+    dropped: tuple[Candidate, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -123,15 +128,20 @@ def search_in_motion(
     exclude: Sequence[str] = (),
     step: Callable[[str, int, int], None] = lambda name, done, total: None,
     significance: float = SIGNIFICANCE,
+    shown: Sequence[Candidate] = (),
+    declared: CableModel | None = None,
 ) -> InMotion:
-    """Add effects until none is significant.
+    """Add effects until none is significant, and drop what they have made superfluous.
 
     `fit`: of the declared model over a first stretch, which hardly tells what is missing. The later
     a fit looks, the farther off what is missing drives it: at the end of each of STRETCHES that the
     model as it is does not explain the candidates are compared with it, all from where the stretch
     before has left it; and at the last one, where it explains them, from its minimum.
+
+    `shown`: what still poses have shown beside the `declared` model.
     """
     now, added, first = fit, list[AddedInMotion](), dict[str, float]()
+    level = significance
     before: MotionFit | None = None
     for end in [x for x in STRETCHES if x > fit.until] or [fit.until]:
         start = now
@@ -146,14 +156,36 @@ def search_in_motion(
             scores = scored(start, moving) | scored_by_place(start, weights)
             first = first or {name: one.value for name, one in scores.items()}
             tried = sum(max(1.0, len(x.scans) / SCANS_PER_TEST) for x in (*moving, *weights))
-            chosen = _best(start, now, scores, sidak_level(significance, tried), tried)
+            level = sidak_level(significance, tried)
+            chosen = _best(start, now, scores, level, tried)
             if chosen is None:
                 break
             before = before or _whole(now)
             added.append(chosen[1])
             now = start = chosen[0]
+    dropped: list[Candidate] = []
+    if added:
+        others = [*shown, *(one.candidate for one in added[:-1])]
+        now, dropped = _needed(now, others, declared or now.fit.model, level)
     step("search for what motion lacks", MOST, MOST)
-    return InMotion(before or now, now, tuple(added), first)
+    left = tuple(one for one in added if one.candidate not in dropped)
+    return InMotion(before or now, now, left, first, tuple(x for x in shown if x in dropped))
+
+
+def _needed(
+    now: MotionFit, others: Sequence[Candidate], declared: CableModel, level: float
+) -> tuple[MotionFit, list[Candidate]]:
+    """The fit without those of the effects that lose less than their price, and these."""
+    dropped = []
+    for item in others:
+        try:
+            smaller = rejoined(now, item.remove_from(now.fit.model, declared), {})
+        except EstimationError:
+            continue  # what nothing can be followed without is needed
+        if _counted(smaller.objective - now.objective, now, item) < _price(item, level):
+            dropped.append(item)
+            now = smaller
+    return now, dropped
 
 
 def _whole(now: MotionFit) -> MotionFit:
@@ -272,13 +304,19 @@ def _square(fit: MotionFit, item: Candidate) -> float:
     return max((size**2 for size in sizes), default=0.0)
 
 
+def _counted(whole: float, fit: MotionFit, item: Candidate) -> float:
+    """What a fit with an effect gains, as far as it counts: see the top of this module."""
+    if whole <= 0.0:
+        return whole
+    return min(whole / _excess(fit, item), _square(fit, item) / 2)
+
+
 class _Refit(NamedTuple):
-    """A candidate's fit: what it gains, its `_excess`, its gain as counted, and its `_price`."""
+    """A candidate's fit: what it gains, its gain as `_counted`, and its `_price`."""
 
     candidate: Candidate
     fit: MotionFit
     whole: float
-    excess: float
     gain: float
     price: float
 
@@ -307,15 +345,16 @@ def _best(
             trial = rejoined(start, model, one.values)
         except EstimationError:
             continue
-        whole, excess = now.objective - trial.objective, _excess(trial, item)
-        gain = min(whole / excess, _square(trial, item) / 2)
-        fitted.append(_Refit(item, trial, whole, excess, gain, _price(item, level)))
+        whole = now.objective - trial.objective
+        gain, price = _counted(whole, trial, item), _price(item, level)
+        fitted.append(_Refit(item, trial, whole, gain, price))
     significant = [x for x in fitted if x.gain > x.price]
     if not significant:
         return None
     # Candidates are compared at one excess, of what the best fit leaves: that of another one has
     # what it misses, too, and each one's own would decide between like ones.
-    common = max(fitted, key=lambda x: x.whole).excess
+    best = max(fitted, key=lambda x: x.whole)
+    common = _excess(best.fit, best.candidate)
 
     def net(x: _Refit) -> float:
         return x.whole / common - x.price

@@ -8,12 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from dlo_casadi.arrays import Brief, FloatArray
+from dlo_casadi.diagnosis.candidates import Candidate
 from dlo_casadi.diagnosis.in_motion import AddedInMotion, InMotion, search_in_motion
 from dlo_casadi.diagnosis.told_apart import among_dead_loads
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.motion_fit import MotionFit, fit_motions, predicted, repeated_fit
 from dlo_casadi.estimation.motion_start import FIRST_STRETCHES
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.sensing.measured_motion import MeasuredMotion
 from dlo_casadi.session.found_effects import FoundEffect, effect_parameters, with_motions
 from dlo_casadi.session.measured_modes import MeasuredModes, measured_modes
@@ -92,6 +94,8 @@ class MovingResult:
     scores : dict
         Of each candidate, see `search_in_motion`.
     modes : MeasuredModes or None
+    dropped : frozenset of str
+        Labels of effects that still poses had shown and that these have made superfluous.
     """
 
     fit: Fit
@@ -99,6 +103,7 @@ class MovingResult:
     effects: tuple[FoundEffect, ...]
     scores: dict[str, float]
     modes: MeasuredModes | None
+    dropped: frozenset[str]
 
 
 def fit_moving(
@@ -110,10 +115,12 @@ def fit_moving(
     diagnosed: bool,
     significance: float = SIGNIFICANCE,
     damping_time: float | None = None,
+    shown: Sequence[Candidate] = (),
+    declared: CableModel | None = None,
 ) -> MovingResult:
     """Fit the motions of a session with its still poses, and search for what the model lacks.
 
-    `damping_time` [s]: a first guess.
+    `damping_time` [s]: a first guess. `shown`: what still poses have shown beside `declared`.
 
     Raises
     ------
@@ -125,7 +132,7 @@ def fit_moving(
     before = fit_motions(fit, motions, damping_time=damping_time, until=until)
     step("fit the motions", 1, 1)
     found = (
-        search_in_motion(before, exclude, step, significance)
+        search_in_motion(before, exclude, step, significance, shown, declared)
         if diagnosed
         else InMotion(before, before, (), {})
     )
@@ -137,6 +144,7 @@ def fit_moving(
         tuple(_found_effect(both, found.after, item) for item in found.added),
         found.scores,
         measured_modes(fit, both, motions),
+        frozenset(item.effect.label for item in found.dropped),
     )
 
 

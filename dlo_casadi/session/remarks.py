@@ -10,6 +10,7 @@ from dlo_casadi.equilibrium.pose import SIGNS
 from dlo_casadi.errors import worded
 from dlo_casadi.estimation.fit import EXPLAINED
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.session.found_effects import FoundEffect
 from dlo_casadi.session.outcome import SIMPLER, PoseInput, Stage
 from dlo_casadi.session.outliers import LEAST_POINTS, Outliers
 from dlo_casadi.session.pose_shape import BranchShape, PoseShape
@@ -175,6 +176,17 @@ def as_likely(names: Sequence[str]) -> list[str]:
         f"{' and '.join(names)} would explain what was measured as well as waves of the rest "
         "curvature, or differences from pose to pose, do alone: the data do not tell them apart. "
         "Try: markers at more places, lines, more poses"
+    ]
+
+
+def not_in_motion(still: Sequence[FoundEffect], now: Sequence[FoundEffect]) -> list[str]:
+    """Effects that still poses have shown and that the motions have replaced by others."""
+    names = ", ".join(x.name for x in now)
+    kept = {x.label for x in now}
+    return [
+        f"{x.name} would explain the still poses alone; the motions need {names} instead"
+        for x in still
+        if x.label not in kept
     ]
 
 

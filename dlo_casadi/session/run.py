@@ -164,8 +164,10 @@ class _Run:
         else:
             fit, found, added = nearest, {}, ()
         if self.motions:
+            still, model = found.get("effects", ()), declared.model
             try:
-                fit, found = self.moved(fit, found, added, stages, measured, reported)
+                fit, found = self.moved(fit, found, added, stages, measured, reported, model)
+                warnings += remarks.not_in_motion(still, found["effects"])
             except EstimationError as error:
                 # What the still poses tell stands without them.
                 warnings.append(f"recorded motions could not be fitted: {error.message}")
@@ -279,18 +281,20 @@ class _Run:
         stages: list[Stage],
         measured: Sequence[MeasuredPose],
         reported: Sequence[str],
+        declared: CableModel,
     ) -> tuple[Fit, dict[str, Any]]:
         """Fit the motions with the still poses; the last stage becomes that of both.
 
-        Of effects `added` that still shapes leave tied the motions choose. Another stage follows if
-        effects are found that only motion shows.
+        Of effects `added` to the `declared` model that still shapes leave tied the motions choose.
+        Another stage follows if effects are found that only motion shows.
         """
         began, options = time.perf_counter(), self.config.diagnosis
-        effects = list(found.get("effects", ()))
+        effects, shown = list(found.get("effects", ())), [item.candidate for item in added]
         for k, item in enumerate(added):
             told = among_rivals(fit, item, self.motions, self.config.cable.damping_time)
             if told:
-                fit, effects[k] = told[0].fit, with_motions(effects[k], told[0], told)
+                fit, shown[k] = told[0].fit, told[0].candidate
+                effects[k] = with_motions(effects[k], told[0], told)
         result = fit_moving(
             fit,
             self.motions,
@@ -299,9 +303,11 @@ class _Run:
             diagnosed=options.enabled,
             significance=options.significance,
             damping_time=self.config.cable.damping_time,
+            shown=shown,
+            declared=declared,
         )
         self.seconds["motion"] = time.perf_counter() - began
-        effects = [*effects, *result.effects]
+        effects = [x for x in effects if x.label not in result.dropped] + [*result.effects]
         names = [*reported, *_parameters_of({x.label for x in effects}, result.fit.model)]
         last = stages[-1]
         own = fit_stage(last.name, result.fit, measured, profile_intervals(result.fit), names)

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dlo_casadi.diagnosis.candidates import Candidate
 from dlo_casadi.diagnosis.in_motion import search_in_motion
 from dlo_casadi.effects import AirDrag, CableData
-from dlo_casadi.effects.stiffness import DynamicStiffness
+from dlo_casadi.effects.stiffness import DynamicStiffness, StiffnessGradient
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
@@ -41,24 +42,34 @@ def noise(k: int, shape: tuple[int, ...]) -> np.ndarray:
     return STD * np.random.default_rng(k).normal(size=shape)
 
 
-def still(k: int, heading: float) -> MeasuredPose:
+def values_of(model: CableModel, **known: float) -> np.ndarray:
+    nominal = zip(model.names, model.nominal, strict=True)
+    return np.array([known.get(name.split(".")[-1], value) for name, value in nominal])
+
+
+def still(k: int, heading: float, slope: float = 0.0) -> MeasuredPose:
     """Markers of a shape at rest."""
-    model, pose = model_of(TRUE, 24), HeldPose(start=START, start_heading=heading)
-    eq = solve_equilibrium(model, model.nominal, np.zeros(model.chain.n_rests), pose)
-    seen = BatchEquilibrium(model, [pose], wrenches=False).seen(
-        eq.shapes, model.nominal, np.zeros(model.chain.n_rests)
-    )
+    model = model_of(TRUE, 24, (StiffnessGradient(),))
+    pose = HeldPose(start=START, start_heading=heading)
+    p, rest = values_of(model, slope=slope), np.zeros(model.chain.n_rests)
+    eq = solve_equilibrium(model, p, rest, pose)
+    seen = BatchEquilibrium(model, [pose], wrenches=False).seen(eq.shapes, p, rest)
     points = seen[0].curve.at(S) + noise(k, (len(S), 2))
     return MeasuredPose.of_points(pose, points, s=S)
 
 
 def motion(
-    name: str, k: int, *, drag: float = 0.0, stiffer: float = 1.0, held_out: bool = False
+    name: str,
+    k: int,
+    *,
+    drag: float = 0.0,
+    stiffer: float = 1.0,
+    slope: float = 0.0,
+    held_out: bool = False,
 ) -> MeasuredMotion:
     """Markers of a cable whose clamp is carried aside in a third of a second."""
-    model = model_of(TRUE, 16, (AirDrag(), DynamicStiffness()))
-    known = {"air_drag.coefficient": drag, "dynamic_stiffness.factor": stiffer}
-    p = np.array([known.get(x, y) for x, y in zip(model.names, model.nominal, strict=True)])
+    model = model_of(TRUE, 16, (AirDrag(), DynamicStiffness(), StiffnessGradient()))
+    p = values_of(model, coefficient=drag, factor=stiffer, slope=slope)
     cable = MovingCable(model, p, np.zeros(model.chain.n_rests))
     t = np.arange(0.0, 0.7, 0.01)
     share = np.clip((t - 0.05) / 0.3, 0.0, 1.0)
@@ -77,9 +88,12 @@ def motion(
     )
 
 
+HEADINGS = (-0.2, -0.7, -1.2, 0.3)
+
+
 @pytest.fixture(scope="module")
 def stills() -> list[MeasuredPose]:
-    return [still(k, heading) for k, heading in enumerate((-0.2, -0.7, -1.2, 0.3))]
+    return [still(k, heading) for k, heading in enumerate(HEADINGS)]
 
 
 @pytest.fixture(scope="module")
@@ -148,3 +162,15 @@ def test_what_a_tolerance_hides_is_found_without_a_misfit(at_rest: Fit) -> None:
     factor = found.after.fit
     std = factor.std("dynamic_stiffness.factor")
     assert abs(factor.value("dynamic_stiffness.factor") - 1.13) < 3 * std
+
+
+@pytest.mark.parametrize(("slope", "dropped"), [(0.0, ["stiffness_gradient"]), (0.3, [])])
+def test_what_still_poses_showed_is_judged_again(slope: float, dropped: list[str]) -> None:
+    taper, poses = StiffnessGradient(), [still(k, x, slope) for k, x in enumerate(HEADINGS)]
+    names = (("stiffness_gradient.slope",), ("stiffness_gradient.slope",))
+    before = fit_model(model_of(DECLARED, 20, (taper,)), poses, Tolerances(), STD)
+    shown = Candidate(taper, *names, (), nuisance=False)
+    found = search_in_motion(fitted(before, stiffer=1.13, slope=slope), shown=[shown])
+    assert [item.candidate.name for item in found.added] == ["dynamic_stiffness"]
+    assert [item.name for item in found.dropped] == dropped
+    assert (taper.label in {x.label for x in found.after.fit.model.effects}) is not dropped
