@@ -23,7 +23,7 @@ declared; with --strong EFFECT that effect is hidden at a size far beyond the no
 effects those count that the data show: that make the declared model less likely by e^15 when both
 are fitted from the truth. How often each is named, alone or among what cannot be told from it, is
 counted, how often a wrong one is, and how often a stiffness lies in its interval where all that is
-hidden shows and is named.
+hidden shows and is named, over all and by how the ends are held and what is measured.
 """
 
 from __future__ import annotations
@@ -211,6 +211,11 @@ def summary(rows: list[dict]) -> str:
         inside = [row["inside"][name] for row in right if name in row["inside"]]
         if inside:
             said.append(f"{name} in its interval in {100 * np.mean(inside):.1f} %")
+        for kind in sorted({row["kind"] for row in right}):
+            of_kind = [row["inside"] for row in right if row["kind"] == kind]
+            own = [found[name] for found in of_kind if name in found]
+            if own:
+                said.append(f"({kind}: {sum(own)} of {len(own)})")
     named = [len(row["hidden"]) - len(row.get("named", [])) for row in rows]
     for name in ("bending_stiffness", "torsional_stiffness"):
         for what, kept in (("hidden and not named", True), ("nothing is", False)):
@@ -245,7 +250,7 @@ def run_random(
     found = simulated(generator, 3 if space else 2, count, random, table, strong, poses)
     begin = time.process_time()
     row = {"hidden": found.hidden, "refused": "", "wrong": [], "inside": {}, "worse": False}
-    row["if_hidden"] = {}
+    row |= {"if_hidden": {}, "kind": found.kind}
     try:
         result = found.session.fit()
     except dlo.DloError as error:

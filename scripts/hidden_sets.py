@@ -161,11 +161,14 @@ class Simulated:
         Names of the effects that are not declared.
     values : dict
         True parameters by qualified name [SI].
+    kind : str
+        How both ends are held, and what is measured: "pinned, lines".
     """
 
     session: dlo.Session
     hidden: tuple[str, ...]
     values: Mapping[str, float]
+    kind: str
 
 
 def simulated(
@@ -273,7 +276,8 @@ def _tried(
         std=MARKERS[1] if marked else None,
         force_std=FORCE_STD if read else None,
     )
-    return Simulated(session, hidden, values)
+    kind = f"{held}, {'markers' if marked else 'lines'}"
+    return Simulated(session, hidden, values, kind)
 
 
 def _finely(
