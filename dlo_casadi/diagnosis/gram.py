@@ -7,8 +7,8 @@ nominal values, the columns c of a subset of candidates and those b of the fit i
 
 with the fit's own directions, nuisances and deviations projected out. T is the predicted decrease
 of twice the objective. If nothing is missing it follows chi-square, with one degree of freedom per
-linear parameter. One candidate at one place is a subset, too: its T is its score. A larger subset
-is found from the best smaller ones: beside a subset a, a candidate f gains
+linear parameter. One candidate at one place is a subset, too: its T is its score. Beside another
+one a candidate f gains
 
     r^T S^-1 r,   r = u_f - I_fa I_aa^-1 u_a,   S = I_ff - I_fa I_aa^-1 I_af
 
@@ -19,7 +19,7 @@ Rao, Proc. Cambridge Phil. Soc. 44 (1948); Miller, Subset Selection in Regressio
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -38,8 +38,6 @@ from dlo_casadi.thresholds import COLLINEAR, SCANS_PER_TEST
 # Ridge of subsets, relative to each direction's information: of two candidates that act alike to a
 # hundredth, the difference counts half. The linearisation is not more accurate than that.
 RIDGE = 1e-4
-# Number of smaller subsets that are extended by another candidate: of pairs to triples.
-EXTENDED = 30
 
 
 class Place(NamedTuple):
@@ -182,10 +180,10 @@ class Gram:
     # ---- subsets -----------------------------------------------------------------------------
 
     def subsets(self, size: int, count: int) -> list[tuple[Screened, ...]]:
-        """The `count` subsets of so many candidates that gain most, each at its best places."""
+        """The `count` single candidates or pairs that gain most, each at its best places."""
         found: dict[frozenset[str], tuple[Screened, ...]] = {}
         every = list(self.places)
-        for _, subset in self._largest(size):
+        for _, subset in sorted(self._pairs() if size > 1 else self._each(), reverse=True):
             names = frozenset(self._of[every[i].label].name for i in subset)
             if names in found or len(names) < size:
                 continue
@@ -196,33 +194,17 @@ class Gram:
                 break
         return list(found.values())
 
-    def _largest(self, size: int) -> list[tuple[float, tuple[int, ...]]]:
-        """Gains of subsets of places, largest first."""
-        gains: list[tuple[float, tuple[int, ...]]]
-        if size == 1:
-            u = self._whitened[0]
-            gains = [(float(x @ x), (i,)) for i, x in enumerate(u)]
-        else:
-            smaller = self._largest(size - 1)
-            begun = smaller if size == 2 else self._distinct(smaller)[:EXTENDED]
-            rows = ((base, subset, self._beside(subset)) for base, subset in begun)
-            gains = [
-                (base + float(more), (*subset, k))
-                for base, subset, row in rows
-                for k, more in enumerate(row)
-                if more > 0 and (size > 2 or k > subset[0])
-            ]
-        return sorted(gains, reverse=True)
+    def _each(self) -> Iterator[tuple[float, tuple[int, ...]]]:
+        """Gain of each place."""
+        for i, x in enumerate(self._whitened[0]):
+            yield float(x @ x), (i,)
 
-    def _distinct(
-        self, ordered: Iterable[tuple[float, tuple[int, ...]]]
-    ) -> list[tuple[float, tuple[int, ...]]]:
-        """The first one of each set of candidates, at whatever places."""
-        labels = [x.label for x in self.places]
-        best: dict[frozenset[str], tuple[float, tuple[int, ...]]] = {}
-        for item in ordered:
-            best.setdefault(frozenset(labels[i] for i in item[1]), item)
-        return list(best.values())
+    def _pairs(self) -> Iterator[tuple[float, tuple[int, ...]]]:
+        """Gain of each pair of places."""
+        for alone, (i,) in self._each():
+            for k, more in enumerate(self._beside(i)[i + 1 :], i + 1):
+                if more > 0:
+                    yield alone + float(more), (i, k)
 
     @cached_property
     def _whitened(self) -> tuple[FloatArray, FloatArray]:
@@ -244,21 +226,16 @@ class Gram:
         n = len(places)
         return (scaled.slope @ flat).reshape((n, q)), information.reshape((n, q, n, q))
 
-    def _beside(self, subset: Sequence[int]) -> FloatArray:
-        """Gain (E,) of each further place beside a subset; none of candidates that are in it."""
+    def _beside(self, place: int) -> FloatArray:
+        """Gain (E,) of each further place beside one; none of the same candidate."""
         u, information = self._whitened
-        (n, q), kept = u.shape, list(subset)
-        own = information[kept].reshape((len(kept) * q, n * q))
-        block = information[np.ix_(kept, range(q), kept, range(q))]
-        block = block.reshape((len(own), len(own))) + RIDGE * np.eye(len(own))
-        arm = np.linalg.solve(block, np.column_stack([own, u[kept].ravel()]))
-        left = u - (own.T @ arm[:, -1]).reshape((n, q))
-        shared = np.einsum("ane,anf->nef", own.reshape((-1, n, q)), arm[:, :-1].reshape((-1, n, q)))
-        remaining = (1 + RIDGE) * np.eye(q) - shared
+        ridge, q = 1 + RIDGE, u.shape[1]
+        own = information[place]
+        left = u - np.einsum("a,ane->ne", u[place], own) / ridge
+        remaining = ridge * np.eye(q) - np.einsum("ane,anf->nef", own, own) / ridge
         gains = (left * np.linalg.solve(remaining, left[..., None])[..., 0]).sum(axis=1)
         labels = [x.label for x in self.places]
-        taken = {labels[k] for k in kept}
-        return np.where([label in taken for label in labels], 0.0, gains)
+        return np.where([label == labels[place] for label in labels], 0.0, gains)
 
     # ---- what is not excluded ----------------------------------------------------------------
 
