@@ -284,8 +284,19 @@ def with_new_noise(
     if from_shapes or not (base.scatters or not fit.errors_known):
         return fit, p_value
     again = p_under_new_noise(winner, fit, base, len(p_values))
-    # A scatter from pose to pose may be due to the effect alone.
-    return fit, again if base.scatters else max(p_value, again)
+    if not base.scatters:
+        return fit, max(p_value, again)
+    # A scatter from pose to pose may be due to the effect alone; one that explains as much is not.
+    return fit, again if fit.scatters else max(
+        again, p_of_evidence(winner, fit, base, len(p_values))
+    )
+
+
+def p_of_evidence(item: Confirmed, fit: Fit, base: Fit, tried: int) -> float:
+    """Significance of a refit's effects beside a base that explains by a scatter what they do."""
+    gain = 2 * (fit.log_evidence - base.log_evidence)
+    dof, degrees = len(item.candidate.frees), noise_degrees(fit)
+    return sidak(survival(gain, dof, degrees), tried * item.candidate.alike)
 
 
 def p_under_new_noise(winner: Confirmed, fit: Fit, base: Fit, tried: int) -> float:
