@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
+from scipy.stats import chi2
 
 from dlo_casadi.diagnosis import refits
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
@@ -13,7 +14,7 @@ from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.diagnosis.gram import sidak
 from dlo_casadi.diagnosis.refits import refit_with, refit_without
 from dlo_casadi.diagnosis.screening import Screen, _Moving
-from dlo_casadi.diagnosis.selection import AddedEffect
+from dlo_casadi.diagnosis.selection import AddedEffect, p_of_evidence
 from dlo_casadi.diagnosis.trials import Trials, judged
 from dlo_casadi.diagnosis.unknown_force import _Search
 from dlo_casadi.effects import EFFECTS, CableData, ClipOffset, LengthError, LumpedMass, UnknownPull
@@ -218,3 +219,16 @@ def test_the_offset_of_another_clip_replaces_a_first_one():
     own = replace(own, fit=better, screened=replace(own.screened, candidate=effect.candidate))
     own = replace(own, validation=cross_validate(better))
     assert judged(trials, own, base, before, effect) == (better, [effect])
+
+
+@pytest.mark.parametrize(("ahead", "significant"), [(5.0, False), (25.0, True)])
+def test_an_effect_has_to_explain_more_than_the_scatter_in_its_place(ahead, significant):
+    """With three parameters, of 18 candidates: a chi-square of 19 is one in 200 by chance."""
+    scatter = SimpleNamespace(dof=np.inf)
+    known = SimpleNamespace(slow_dof=np.inf)
+    problem = SimpleNamespace(priors=SimpleNamespace(pose_scatter=scatter))
+    fits = [SimpleNamespace(log_evidence=x, noise=known, problem=problem) for x in (ahead, 0.0)]
+    item = SimpleNamespace(candidate=SimpleNamespace(frees=("a", "b", "c"), alike=1))
+    p_value = p_of_evidence(item, *fits, 18)
+    assert p_value == pytest.approx(sidak(chi2.sf(2 * ahead, 3), 18), rel=1e-6)
+    assert (p_value < SIGNIFICANCE) is significant
