@@ -236,14 +236,11 @@ def pruned(trials: Trials, fit: Fit, added: list[AddedEffect]) -> tuple[Fit, lis
     """
     accepted, fit = fit, trials.fine(fit, FINEST_MESH) if added else fit
     last = [effect for effect in added if effect.after is added[-1].after]
-    from_shapes = trials.starts_at_shapes(trials.declared)
-    few = [effect for effect in added if from_shapes and effect.after is added[0].after]
     for effect in added:
         smaller = refits.refit_without(fit, effect.candidate, trials.declared)
         if smaller is None:
             continue
-        # A pair was compared with few other pairs, and what was found from the shapes with few.
-        compared = len(last) == 1 and effect in last and effect not in few
+        compared = len(last) == 1 and effect in last  # a pair was compared with few other pairs
         before, after = effect.before, effect.after
         if not (compared and fit is accepted):
             before, after = cross_validate(smaller), cross_validate(fit)
