@@ -201,7 +201,7 @@ def _near_least(
 
 def _is_last(item: Confirmed) -> bool:
     """Whether no larger subset is tried: what this fit still lacks is found in the next step."""
-    return explains(item.fit)
+    return item.fit.noise.source != "misfit" and item.fit.chi2_per_dof < CLOSE
 
 
 @accounted_as("fits from the shapes")

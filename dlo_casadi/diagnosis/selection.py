@@ -281,9 +281,7 @@ def with_new_noise(
         fit = settle(fit) if fit.noise.source != "misfit" else descend(fit)
     except EstimationError:
         return base, 1.0
-    if from_shapes:
-        return fit, min(p_value, p_of_evidence(winner, fit, base, len(p_values)))
-    if not (base.scatters or not fit.errors_known):
+    if from_shapes or not (base.scatters or not fit.errors_known):
         return fit, p_value
     again = p_under_new_noise(winner, fit, base, len(p_values))
     if not base.scatters:
@@ -295,7 +293,7 @@ def with_new_noise(
 
 
 def p_of_evidence(item: Confirmed, fit: Fit, base: Fit, tried: int) -> float:
-    """Significance of what a refit's effects gain in evidence over a base of other weights."""
+    """Significance of a refit's effects beside a base that explains by a scatter what they do."""
     gain = 2 * (fit.log_evidence - base.log_evidence)
     dof, degrees = len(item.candidate.frees), noise_degrees(fit)
     return sidak(survival(gain, dof, degrees), tried * item.candidate.alike)
