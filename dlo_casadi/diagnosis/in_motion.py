@@ -166,7 +166,9 @@ def search_in_motion(
     dropped: list[Candidate] = []
     if added:
         others = [*shown, *(one.candidate for one in added[:-1])]
-        now, dropped = _needed(now, others, declared or now.fit.model, level)
+        # What is dropped and only differs within a tolerance gets its prior back.
+        priors = {**fit.fit.model.priors, **(declared.priors if declared else {})}
+        now, dropped = _needed(now, others, replace(fit.fit.model, priors=priors), level)
     step("search for what motion lacks", MOST, MOST)
     left = tuple(one for one in added if one.candidate not in dropped)
     return InMotion(before or now, now, left, first, tuple(x for x in shown if x in dropped))
@@ -353,8 +355,8 @@ def _best(
         return None
     # Candidates are compared at one excess, of what the best fit leaves: that of another one has
     # what it misses, too, and each one's own would decide between like ones.
-    best = max(fitted, key=lambda x: x.whole)
-    common = _excess(best.fit, best.candidate)
+    likeliest = max(fitted, key=lambda x: x.whole)
+    common = _excess(likeliest.fit, likeliest.candidate)
 
     def net(x: _Refit) -> float:
         return x.whole / common - x.price

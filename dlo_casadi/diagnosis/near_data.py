@@ -150,7 +150,7 @@ def near_data(
         starts += map_in_order(executor, begin, new)
         if fit(last=False) or bound.met:
             break
-    if not any(map(_is_last, tried)):
+    if not (any(map(_is_last, tried)) or (bound.met and tried)):
         fit(last=True)
     screened = in_order([*(gram.singles if gram else ()), *contacts])
     tried = loads_from_best(base, screened, tried, executor)

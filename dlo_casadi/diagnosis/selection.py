@@ -286,10 +286,10 @@ def with_new_noise(
     again = p_under_new_noise(winner, fit, base, len(p_values))
     if not base.scatters:
         return fit, max(p_value, again)
-    # A scatter from pose to pose may be due to the effect alone; one that explains as much is not.
-    return fit, again if fit.scatters else max(
-        again, p_of_evidence(winner, fit, base, len(p_values))
-    )
+    # A scatter from pose to pose may be due to the effect alone, or explain as much as it does.
+    if not fit.scatters:
+        again = max(again, p_of_evidence(winner, fit, base, len(p_values)))
+    return fit, again
 
 
 def p_of_evidence(item: Confirmed, fit: Fit, base: Fit, tried: int) -> float:

@@ -6,14 +6,20 @@ import numpy as np
 import pytest
 
 from dlo_casadi.diagnosis.candidates import Candidate
-from dlo_casadi.diagnosis.in_motion import search_in_motion
+from dlo_casadi.diagnosis.in_motion import _needed, in_motion_only, search_in_motion
 from dlo_casadi.effects import AirDrag, CableData
 from dlo_casadi.effects.stiffness import DynamicStiffness, StiffnessGradient
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.estimation.motion_fit import MotionFit, fit_motions, predicted, repeated_fit
+from dlo_casadi.estimation.motion_fit import (
+    MotionFit,
+    fit_motions,
+    predicted,
+    rejoined,
+    repeated_fit,
+)
 from dlo_casadi.estimation.recording import held_by
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.cable_model import CableModel
@@ -174,3 +180,14 @@ def test_what_still_poses_showed_is_judged_again(slope: float, dropped: list[str
     assert [item.candidate.name for item in found.added] == ["dynamic_stiffness"]
     assert [item.name for item in found.dropped] == dropped
     assert (taper.label in {x.label for x in found.after.fit.model.effects}) is not dropped
+
+
+def test_a_tolerance_that_is_dropped_has_its_prior_again(moving: MotionFit) -> None:
+    """Whether motion or still poses had freed it: the model of the motions knows both."""
+    model = moving.fit.model
+    (stiffness,) = (x for x in in_motion_only(model) if x.name == "dynamic_stiffness")
+    freed = rejoined(moving, stiffness.add_to(model), {})
+    assert "dynamic_stiffness.factor" not in freed.fit.model.priors
+    now, dropped = _needed(freed, [stiffness], model, 0.005)
+    assert dropped == [stiffness]
+    assert now.fit.model.priors == model.priors
