@@ -270,7 +270,8 @@ def with_new_noise(
     the noise. If nothing else is missing, all that is left with it is noise, including its slow
     modes; otherwise the noise is too large and the significance too low.
 
-    A refit that is weighed by its misfit stays so. If a refit has run away (no noise can be
+    A refit that is weighed by its misfit stays so. Beside a misfit the gain in evidence is tested,
+    as a score at a soft balance may miss what counts. If a refit has run away (no noise can be
     estimated, or poses are lost), the base and 1 are returned. `from_shapes`: the base is too far
     from the measured shapes for a test of their likelihoods.
     """
@@ -281,6 +282,8 @@ def with_new_noise(
         fit = settle(fit) if fit.noise.source != "misfit" else descend(fit)
     except EstimationError:
         return base, 1.0
+    if base.noise.source == "misfit":
+        return fit, p_of_evidence(winner, fit, base, len(p_values))
     if from_shapes or not (base.scatters or not fit.errors_known):
         return fit, p_value
     again = p_under_new_noise(winner, fit, base, len(p_values))
@@ -293,7 +296,7 @@ def with_new_noise(
 
 
 def p_of_evidence(item: Confirmed, fit: Fit, base: Fit, tried: int) -> float:
-    """Significance of a refit's effects beside a base that explains by a scatter what they do."""
+    """Significance of what a refit's effects gain in evidence over a base of other weights."""
     gain = 2 * (fit.log_evidence - base.log_evidence)
     dof, degrees = len(item.candidate.frees), noise_degrees(fit)
     return sidak(survival(gain, dof, degrees), tried * item.candidate.alike)
