@@ -219,16 +219,9 @@ class Search:
     def best(
         self, beginnings: Sequence[Beginning] | None = None, found: Found | None = None
     ) -> tuple[Found, UnknownForce | None]:
-        """The best result of searches that begin in different ways, and the last unknown force.
-
-        From the measured shapes first if the fit leaves far more than noise: in such a fit the
-        first effect may stand for two, and the next ones then only fit its error.
-        """
+        """The best result of searches that begin in different ways, and the last unknown force."""
         force = None
-        if beginnings is None:
-            lost = self.may_be_far and not explains(self.declared)
-            beginnings = (SHAPES, *NEAR) if lost else (*NEAR, SHAPES)
-        for beginning in beginnings:
+        for beginning in beginnings or (*NEAR, SHAPES):
             if found is not None and not (self.goes_on and beginning.applies(self, found)):
                 continue
             with suppress(EstimationError):

@@ -44,8 +44,7 @@ LARGEST = 3
 # Ratio of what two starts leave, or of what one leaves to the noise, within which they are close.
 # Starts close to the best one are fitted: in two sessions in space the hidden effect left 3105 and
 # 8250, its only rival 8051, and all others 27800 and more. Candidates close to the noise are fitted
-# before larger subsets are started; beside a base that is no misfit, what such a fit lacks is found
-# in the next step.
+# before larger subsets are started.
 CLOSE = 3.0
 
 # Candidates that are started beside each of the best starts. In two sessions in space whose pairs
@@ -122,11 +121,6 @@ def near_data(
     far: dict[str, str] = {x.candidate.name: NOT_NEAR for x in contacts}
     far |= {name: NOT_NEAR for start in starts for name in start.names}
 
-    def is_last(item: Confirmed) -> bool:
-        """Whether no larger subset is tried: what a close fit lacks is found in the next step."""
-        close = item.fit.noise.source != "misfit" and item.fit.chi2_per_dof < CLOSE
-        return explains(item.fit) if base.noise.source == "misfit" else close
-
     def stages() -> Iterator[list[tuple[Screened, ...]]]:
         """Subsets that are started one after the other."""
         yield []
@@ -148,7 +142,7 @@ def near_data(
             kept.extend(fitted)
             tried.extend(found)
             far.update({x: LESS_NEAR for y in close[len(fitted) : REFITTED] for x in y.names})
-        return any(map(is_last, tried))
+        return any(explains(item.fit) for item in tried)
 
     for subsets in stages():
         known = [start.names for start in starts]
@@ -156,7 +150,7 @@ def near_data(
         starts += map_in_order(executor, begin, new)
         if fit(last=False) or bound.met:
             break
-    if not (any(map(is_last, tried)) or (bound.met and tried)):
+    if not (any(explains(item.fit) for item in tried) or (bound.met and tried)):
         fit(last=True)
     screened = in_order([*(gram.singles if gram else ()), *contacts])
     tried = loads_from_best(base, screened, tried, executor)
