@@ -88,10 +88,10 @@ def near_data(
     rank high at the other; then, size by size, the shapes are relaxed with each of the best starts,
     and the best candidates by the Gram matrix there join it, as what one effect hides shows once
     that one is there. If nothing comes near the noise the best starts are fitted at the end.
-    Contacts, which have no score, are fitted first, unless their starts leave far more than the
-    best one; if one explains the shapes, only single candidates are compared with it. If the best
-    subset does not explain the shapes, or only by a scatter, its end roll is searched again, then
-    that of the next.
+    A contact, which has no score, is fitted first if its start leaves least; if it explains the
+    shapes, only single candidates are compared with it. Others are fitted if nothing explains the
+    shapes, unless their starts leave far more than the best one. If the best subset does not
+    explain the shapes, or only by a scatter, its end roll is searched again, then that of the next.
 
     Parameters
     ----------
@@ -109,13 +109,17 @@ def near_data(
     begin = partial(RelaxedStart.of, near)
     first = gram.subsets(1, REFITTED) if gram else []
     begun = map_in_order(executor, begin, [*((x,) for x in contacts), *first])
-    touches, starts = begun[: len(contacts)], begun[len(contacts) :]
-    most = CLOSE * min((start.left for start in begun), default=np.inf)
-    touches = [start for start in touches if start.left <= most]
-    touching = [x for x in map_in_order(executor, partial(confirm_contact, base), touches) if x]
+    starts, noise = begun[len(contacts) :], expected_left(near)
+    first_left = min((start.left for start in begun), default=np.inf)
+
+    def touched(above: float, most: float) -> list[Confirmed]:
+        """Fits of the contacts whose starts leave more than the one and at most the other."""
+        kept = [start for start in begun[: len(contacts)] if above < start.left <= most]
+        return [x for x in map_in_order(executor, partial(confirm_contact, base), kept) if x]
+
+    touching = touched(-np.inf, first_left)
     explained = any(explains(item.fit) for item in touching)
-    least = min(start.left for start in touches) if explained else np.inf
-    noise = expected_left(near)
+    least = first_left if explained else np.inf
     kept: list[RelaxedStart] = []
     tried: list[Confirmed] = []
     far: dict[str, str] = {x.candidate.name: NOT_NEAR for x in contacts}
@@ -151,7 +155,9 @@ def near_data(
         if fit(last=False) or bound.met:
             break
     if not (any(explains(item.fit) for item in tried) or (bound.met and tried)):
-        fit(last=True)
+        found = fit(last=True) or explained
+        most = CLOSE * min((start.left for start in starts), default=np.inf)
+        touching += [] if found else touched(first_left, most)
     screened = in_order([*(gram.singles if gram else ()), *contacts])
     tried = loads_from_best(base, screened, tried, executor)
     by_fit = {item.name: item.screened for item in touching}

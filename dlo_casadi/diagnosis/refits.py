@@ -163,19 +163,30 @@ def scored_by_refit(
     if from_shapes:
         near, _ = from_data(base)
         most = left_without(near) / NEAR_NOISE
-        fit = None
         if near.point.data < most:  # a start hardly leaves less than shapes that need not balance
-            begun = RelaxedStart.of(near, (Screened(candidate, 0.0, 1.0, start),))
-            fit = begun.fit() if begun.left < most else None
-        if fit is not None:
-            fit = fit.reweighed(base.noise, base.problem.priors)
-            fits.append(followed(fit, candidate.add_to(base.model), {}))
+            asked = Screened(candidate, 0.0, 1.0, start)
+            fits.append(refit_from_shapes(base, near, asked, most))
     best = min((x for x in fits if x), key=lambda x: x.point.objective, default=None)
     if best is None:
         return Screened(candidate, 0.0, 1.0, start)
     gain = max(2 * (base.point.objective - best.point.objective), 0.0)
     start = {name: best.value(name) for name in candidate.frees}
     return Screened(candidate, gain, survival(gain, len(start), noise_dof), start, fit=best)
+
+
+def refit_from_shapes(base: Fit, near: Fit, screened: Screened, most: float = np.inf) -> Fit | None:
+    """Fit with a candidate added, started at the measured shapes, with the base's weights.
+
+    `near`: the base relaxed there, see `from_data`. None without equilibria, or if the start leaves
+    `most` or more.
+    """
+    begun = RelaxedStart.of(near, (screened,))
+    fit = begun.fit() if begun.left < most else None
+    with suppress(EstimationError):
+        if fit is not None:
+            same = fit.reweighed(base.noise, base.problem.priors)
+            return followed(same, screened.candidate.add_to(base.model), {})
+    return None
 
 
 def confirm(

@@ -97,7 +97,9 @@ class Trials:
     @accounted_as("scores")
     def screened(self, current: Fit, among: Collection[str] | None = None) -> list[Screened]:
         """Score tests of all candidates for a fit, or of those named, best first."""
-        listed = [x for x in self.listed(current) if among is None or x.name in among]
+        every = self.listed(current)
+        listed = [x for x in every if among is None or x.name in among]
+        whole = all(x in listed for x in every if x.effect.gradual)
         given = screening_degrees(current), self.significance, self.executor
         try:
             found, gram = refits.scored(current, listed, *given)
@@ -105,7 +107,7 @@ class Trials:
             # A held-out pose has no equilibrium: what poses leave behind cannot be determined.
             listed = [x for x in listed if not isinstance(x.effect, StateEffect)]
             found, gram = refits.scored(current, listed, *given)
-        if among is None and gram is not None:
+        if whole and gram is not None:
             self.known_grams.append((current, gram))
         return found
 
@@ -135,6 +137,8 @@ class Trials:
         screened = self.first if current is self.declared else self.screened(current)
         known = self.refitted if current is self.declared else {}
         tried = self.leading(current, screened, known)
+        if current is self.declared:
+            tried = self._at_shapes(tried)
         p_values = p_values_of(screened)
         pairs = self._simple_pairs(current, tried, p_values) if largest > 1 else []
         for x in (x for item in pairs for x in item.each):
@@ -142,22 +146,41 @@ class Trials:
             p_values[name] = min(p_values[name], sidak(x.p_value, len(screened)))
         return Tried(screened, p_values, [*tried, *pairs])
 
+    def _at_shapes(self, tried: list[Confirmed]) -> list[Confirmed]:
+        """Refits; if the likeliest leaves more than noise, the better one of two starts of it.
+
+        The second one is at the measured shapes. A softening has two minima where shapes tell
+        hardly more than the largest moment, and what the wrong one leaves looks like a load.
+        """
+        best = max(tried, key=lambda item: item.fit.log_evidence, default=None)
+        if best is None or not best.fit.beyond_noise or self.bound.met:
+            return tried
+        fit = refits.refit_from_shapes(self.declared, self.relaxed[0], best.screened)
+        if fit is None or fit.point.objective >= best.fit.point.objective:
+            return tried
+        found = Confirmed.of(best.screened, self.declared, fit)
+        self.refitted[best.name] = found
+        return [found if item is best and found else item for item in tried]
+
     def _simple_pairs(
         self, current: Fit, tried: Sequence[Confirmed], p_values: Mapping[str, float]
     ) -> list[Confirmed]:
         """Refits of pairs with no more parameters than a single candidate, which may stand for two.
 
         Both have to be significant beside one another, and to promise more than any single one.
+        What the likeliest single one lacks is found in the next step, beside all candidates.
         """
         gram, n = self.gram_beside(current), len(p_values)
         if gram is None or not tried:
             return []
         most = max(len(item.candidate.frees) for item in tried)
         promised = max(item.screened.score for item in tried)
+        likeliest = max(tried, key=lambda item: item.fit.log_evidence).candidate
         pairs = [
             pair
             for pair in gram.subsets(2, BEST)
             if sum(len(x.candidate.frees) for x in pair) <= most
+            and likeliest.name not in [x.candidate.name for x in pair]
             and all(sidak(x.p_value, n) < self.significance for x in pair)
             and gram.gain(pair) > promised
         ]
@@ -282,16 +305,19 @@ def judged(
     others : bool
         Whether other candidates are judged.
     """
-    label, screened = own.candidate.effect.label, []
+    label, screened, listed = own.candidate.effect.label, [], trials.listed(smaller)
     if others and (effect.rivals or not misfits(smaller)):
         rivals = {effect.name, *(rival.name for rival in effect.rival_candidates)}
-        screened = trials.screened(smaller, rivals if misfits(smaller) else None)
+        asked = rivals if misfits(smaller) else {x.name for x in listed}
+        # Without derivative, a score is a refit: that of the effect is known.
+        asked -= {effect.name} if not own.candidate.effect.gradual else set()
+        screened = trials.screened(smaller, asked)
     known: dict[str, Confirmed | None] = {}
     if any(x.candidate.effect.label == label for x in screened):
         known[effect.name] = own
     refitted = trials.leading(smaller, screened, known, own.fit) if screened else []
     refitted = [own, *(item for item in refitted if item is not own)]
-    p_values = {x.name: 1.0 for x in trials.listed(smaller)} | p_values_of(screened)
+    p_values = {x.name: 1.0 for x in listed} | p_values_of(screened)
     decision = decide(smaller, before, Tried(screened, p_values, refitted), *trials.limits)
     with suppress(EstimationError):
         if not decision.chosen:
