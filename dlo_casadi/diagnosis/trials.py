@@ -18,7 +18,7 @@ from dlo_casadi.diagnosis import refits
 from dlo_casadi.diagnosis.candidates import Candidate, candidates_of
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.from_data import from_data
-from dlo_casadi.diagnosis.gram import Gram, Screened, p_values_of, sidak, survival
+from dlo_casadi.diagnosis.gram import Gram, Screened, in_order, p_values_of, sidak, survival
 from dlo_casadi.diagnosis.near_data import near_data
 from dlo_casadi.diagnosis.refits import Confirmed, Tried
 from dlo_casadi.diagnosis.selection import (
@@ -153,7 +153,7 @@ class Trials:
         hardly more than the largest moment, and what the wrong one leaves looks like a load.
         """
         best = max(tried, key=lambda item: item.fit.log_evidence, default=None)
-        if best is None or not best.fit.beyond_noise or self.bound.met:
+        if best is None or not (best.candidate.effect.gradual and best.fit.beyond_noise):
             return tried
         fit = refits.refit_from_shapes(self.declared, self.relaxed[0], best.screened)
         if fit is None or fit.point.objective >= best.fit.point.objective:
@@ -268,7 +268,8 @@ def pruned(trials: Trials, fit: Fit, added: list[AddedEffect]) -> tuple[Fit, lis
         if not (compared and fit is accepted):
             before, after = cross_validate(smaller), cross_validate(fit)
         gain = 2 * (smaller.point.objective - fit.point.objective)
-        start = Screened(effect.candidate, gain, 1.0, {})
+        p_value = survival(max(gain, 0.0), len(effect.candidate.frees), screening_degrees(smaller))
+        start = Screened(effect.candidate, gain, p_value, {})
         own = Confirmed(start, fit, after, gain, settled=True)
         others = not (compared or trials.bound.met)
         fit, found = judged(trials, own, smaller, before, effect, others=others)
@@ -309,9 +310,10 @@ def judged(
     if others and (effect.rivals or not misfits(smaller)):
         rivals = {effect.name, *(rival.name for rival in effect.rival_candidates)}
         asked = rivals if misfits(smaller) else {x.name for x in listed}
-        # Without derivative, a score is a refit: that of the effect is known.
-        asked -= {effect.name} if not own.candidate.effect.gradual else set()
-        screened = trials.screened(smaller, asked)
+        # Without derivative, a score is the gain of a refit: that of the effect is known.
+        known_gain = [] if own.candidate.effect.gradual else [own.screened]
+        asked -= {x.candidate.name for x in known_gain}
+        screened = in_order([*trials.screened(smaller, asked), *known_gain])
     known: dict[str, Confirmed | None] = {}
     if any(x.candidate.effect.label == label for x in screened):
         known[effect.name] = own
