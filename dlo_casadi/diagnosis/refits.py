@@ -34,8 +34,8 @@ from dlo_casadi.diagnosis.screening import Screen
 from dlo_casadi.diagnosis.unknown_force import UnknownForce, places_in, start_from
 from dlo_casadi.effects import PointLoad
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.descent import NEARLY, refit
-from dlo_casadi.estimation.fit import misfits
+from dlo_casadi.estimation.descent import NEARLY, descend, refit
+from dlo_casadi.estimation.fit import explains, misfits
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.variances import refine
 from dlo_casadi.model.cable_model import CableModel
@@ -56,6 +56,8 @@ class Confirmed:
 
     Parameters
     ----------
+    validation : CrossValidation or None
+        None if the base has more evidence: left-out poses are then no reason for it.
     gain : float
         Decrease of twice the objective.
     beside : tuple of Screened
@@ -66,7 +68,7 @@ class Confirmed:
 
     screened: Screened
     fit: Fit
-    validation: CrossValidation
+    validation: CrossValidation | None
     gain: float
     beside: tuple[Screened, ...] = ()
     settled: bool = False
@@ -75,11 +77,18 @@ class Confirmed:
     def of(
         cls, screened: Screened, base: Fit, fit: Fit | None, beside: tuple[Screened, ...] = ()
     ) -> Confirmed | None:
-        """Compare the fit with a candidate, if there is one, with its base."""
+        """Compare the fit with a candidate, if there is one, with its base.
+
+        A fit that explains its points, but has not converged, goes on: else each fit without one of
+        its poses would do so.
+        """
         if fit is None:
             return None
+        if explains(fit) and not fit.converged:
+            fit = descend(fit, tolerance=NEARLY)
         gain = 2 * (base.point.objective - fit.point.objective)
-        return cls(screened, fit, cross_validate(fit), gain, beside)
+        validation = cross_validate(fit) if fit.log_evidence > base.log_evidence else None
+        return cls(screened, fit, validation, gain, beside)
 
     @property
     def candidate(self) -> Candidate:

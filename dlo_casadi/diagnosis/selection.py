@@ -355,6 +355,8 @@ def support(item: Confirmed, base: Fit, validation: CrossValidation) -> float:
     returned alone.
     """
     one = item.fit.log_evidence - base.log_evidence
+    if item.validation is None:
+        return one
     held = base.model.priors
     declared = density_of_declared(item.fit, held) - density_of_declared(base, held) if held else 0
     other = item.validation.log_density - validation.log_density + declared
@@ -371,9 +373,10 @@ def shortcoming(
     decide: if left-out repeats were predicted no better, a gain as large must have a
     probability below `doubt` (Student's t).
     """
-    if item.validation.loses_most_of(validation):
+    if item.validation is not None and item.validation.loses_most_of(validation):
         return "with it most poses that are left out cannot be predicted"
-    if (behind := -support(item, base, validation)) >= 0:
+    behind = -support(item, base, validation)
+    if item.validation is None or behind >= 0:
         return f"makes the data less likely than no effect: log likelihood {behind:.3g} behind"
     chance = 0.0 if doubt is None else validation.chance_of_gain(item.validation)
     if doubt is not None and chance >= doubt:
@@ -425,7 +428,8 @@ def ranking(tried: Tried, base: Fit, validation: CrossValidation) -> list[Ranked
 
     def error(name: str) -> float | None:
         found = refitted.get(name)
-        return found.validation.rmse if found and found.validation.complete else None
+        left_out = found.validation if found else None
+        return left_out.rmse if left_out and left_out.complete else None
 
     names = [item.candidate.name for item in tried.screened]
     rows = [
