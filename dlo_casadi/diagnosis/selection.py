@@ -272,8 +272,8 @@ def with_new_noise(
 
     A refit that is weighed by its misfit stays so. If a refit has run away (no noise can be
     estimated, or poses are lost), the base and 1 are returned. With `from_shapes` the gain in
-    evidence is tested: a score at a soft balance may miss what counts, and the base is too far from
-    the measured shapes for a test of likelihoods at equal weights.
+    evidence of a refit that explains the shapes is tested: a score at a soft balance may miss what
+    counts, and the base is too far from them for a test of likelihoods at equal weights.
     """
     if winner.settled:
         return winner.fit, p_of(winner, winner.fit, base, len(p_values))
@@ -282,9 +282,9 @@ def with_new_noise(
         fit = settle(fit) if fit.noise.source != "misfit" else descend(fit)
     except EstimationError:
         return base, 1.0
-    if from_shapes:
+    if from_shapes and fit.noise.source != "misfit":
         return fit, p_of_evidence(winner, fit, base, len(p_values))
-    if not (base.scatters or not fit.errors_known):
+    if from_shapes or not (base.scatters or not fit.errors_known):
         return fit, p_value
     again = p_under_new_noise(winner, fit, base, len(p_values))
     if not base.scatters:
