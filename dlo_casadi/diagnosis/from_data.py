@@ -149,7 +149,9 @@ class RelaxedStart:
 
         The stiffer a cable, the less a soft balance shows what pushes it up: with a contact, a
         stiffness that has grown a hundredfold never returns. Trials that reach the same minimum are
-        followed once.
+        followed once. A candidate whose linear parameter runs to its bound is tried at the places
+        next to it: a section that is stiff beside the true one, or only in a part of it, ends as
+        stiff as it may be, and there each step of its ends overturns the balance.
         """
         gradual = all(x.candidate.effect.gradual for x in each)
         known = [{}] if gradual else [{}, *_stiffnesses(near)]
@@ -158,7 +160,23 @@ class RelaxedStart:
             loose = cls._loose(near, each, values)
             if not any(loose._like(other) for other in apart):
                 apart.append(loose)
+        if gradual:
+            apart += [cls._loose(near, other, {}) for other in apart[0]._next_to_bounds()]
         return min((x._strict() for x in apart), key=lambda x: x.left)._retried()
+
+    def _next_to_bounds(self) -> list[tuple[Screened, ...]]:
+        """The candidates with each one that has run to a bound at the next places.
+
+        A bound at which an effect vanishes is none: without force it may be anywhere.
+        """
+        unknowns, found = self.problem.unknowns, []
+        names = np.array(unknowns.names)[unknowns.at_bounds(self.values.theta)]
+        for i, x in enumerate(self.each):
+            nearby = {x.scan - 1, x.scan + 1} & {*range(len(x.candidate.scans))}
+            for k in nearby if np.isin(x.candidate.screened, names).any() else ():
+                moved = replace(x, start={**x.start, **x.candidate.scans[k]}, scan=k)
+                found.append((*self.each[:i], moved, *self.each[i + 1 :]))
+        return found
 
     @classmethod
     def _loose(
