@@ -12,13 +12,14 @@ from dlo_casadi.diagnosis import refits
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.diagnosis.gram import sidak
-from dlo_casadi.diagnosis.refits import refit_with, refit_without
+from dlo_casadi.diagnosis.refits import Confirmed, refit_with, refit_without
 from dlo_casadi.diagnosis.screening import Screen, _Moving
 from dlo_casadi.diagnosis.selection import AddedEffect, p_of_evidence
 from dlo_casadi.diagnosis.trials import Trials, judged
 from dlo_casadi.diagnosis.unknown_force import _Search
 from dlo_casadi.effects import EFFECTS, CableData, ClipOffset, LengthError, LumpedMass, UnknownPull
 from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.estimation.descent import refit
 from dlo_casadi.estimation.fit import fit_model, refine_mesh
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.problem import Priors
@@ -83,6 +84,29 @@ def test_a_fixed_effect_stays_when_another_is_added_and_dropped(base):
     smaller = refit_without(larger, taper, base)
     assert kept(smaller) == FIXED
     assert "lumped_mass.mass" not in smaller.problem.unknowns.names
+
+
+def test_the_likeliest_refit_starts_at_the_measured_shapes_too_if_it_leaves_more_than_noise(base):
+    (screened,) = Screen(base, [taper_of(base.model)]).run(np.inf)
+    larger = refit_with(base, screened)
+    stuck = refit(base, larger.model, steps=1, values={"stiffness_gradient.slope": -0.5})
+    trials = Trials(base, None, (), SIGNIFICANCE, InProcess())
+    assert stuck.beyond_noise
+    assert not larger.beyond_noise
+
+    (found,) = trials._at_shapes([Confirmed.of(screened, base, stuck)])
+    assert found.fit.point.objective == pytest.approx(larger.point.objective, rel=1e-3)
+    assert kept(found.fit) == FIXED
+    assert trials.refitted == {"stiffness_gradient": found}
+    known = [Confirmed.of(screened, base, larger)]
+    assert trials._at_shapes(known) == known
+
+
+def test_poses_are_left_out_only_where_a_refit_gains_evidence(base):
+    (screened,) = Screen(base, [taper_of(base.model)]).run(np.inf)
+    larger = refit_with(base, screened)
+    assert Confirmed.of(screened, base, larger).validation is not None
+    assert Confirmed.of(screened, larger, base).validation is None
 
 
 def test_a_score_is_the_gain_of_least_squares_with_the_candidate(base):

@@ -141,6 +141,26 @@ def test_the_effect_has_the_highest_score_and_is_fitted_to_the_noise(base, near,
     assert fit.chi2_per_dof < 1.3
 
 
+def test_a_stiff_section_that_runs_to_its_bound_is_tried_at_the_places_next_to_it(near):
+    listed = candidates(near.model, setup_of(near.model, n_poses=6))
+    section = next(x for x in listed if x.name == "stiff_section")
+    screened = Screened(section, 0.0, 1.0, dict(section.scans[4]), scan=4)
+    start = RelaxedStart._loose(near, (screened,), {})
+    unknowns, theta = start.problem.unknowns, start.values.theta.copy()
+    k = unknowns.names.index("stiff_section.factor")
+
+    def tried(value):
+        theta[k] = value
+        return replace(start, values=replace(start.values, theta=theta))._next_to_bounds()
+
+    lower, upper = (end[k] for end in unknowns.bounds)
+    assert tried((lower + upper) / 2) == []
+    for bound in (lower, upper):
+        found = [item for (item,) in tried(bound)]
+        assert {item.scan for item in found} == {3, 5}
+        assert all(section.scans[x.scan].items() <= x.start.items() for x in found)
+
+
 @pytest.mark.long
 def test_with_another_effect_the_misfit_stays(base, near, screened):
     found = confirm_from_data(base, RelaxedStart.of(near, (screened["stiffness_gradient"],)))

@@ -48,6 +48,7 @@ TRIED = [
     refit("bent", 85.0, 20.0),
     refit("costly", -3.0, 5.0),
     refit("worse", 50.0, -40.0),
+    replace(refit("unasked", -4.0, 0.0), validation=None),
     lost([2], "edge", 49.0, 55.0),
     lost([0, 1, 2, 3], "lost", 49.0, 55.0),
 ]
@@ -61,6 +62,7 @@ def test_each_reason_has_its_number():
         "bent": "log likelihood 20 behind winner",
         "costly": "makes the data less likely than no effect: log likelihood 3 behind",
         "lost": "with it most poses that are left out cannot be predicted",
+        "unasked": "makes the data less likely than no effect: log likelihood 4 behind",
         "worse": "makes the data less likely than no effect: log likelihood 40 behind",
     }
 
