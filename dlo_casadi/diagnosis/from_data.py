@@ -134,6 +134,8 @@ class RelaxedStart:
         Values before and after the relaxation.
     left : float
         Twice the objective; infinite while the balance is still soft.
+    moved : bool
+        Whether its unknowns changed while the balance hardened.
     """
 
     near: Fit
@@ -142,6 +144,7 @@ class RelaxedStart:
     begun: Values
     values: Values
     left: float = np.inf
+    moved: bool = True
 
     @classmethod
     def of(cls, near: Fit, each: tuple[Screened, ...]) -> RelaxedStart:
@@ -149,9 +152,9 @@ class RelaxedStart:
 
         The stiffer a cable, the less a soft balance shows what pushes it up: with a contact, a
         stiffness that has grown a hundredfold never returns. Trials that reach the same minimum are
-        followed once. A candidate whose linear parameter runs to its bound is tried at the places
-        next to it: a section that is stiff beside the true one, or only in a part of it, ends as
-        stiff as it may be, and there each step of its ends overturns the balance.
+        followed once. If no step lowers the objective once the balance hardens, candidates are
+        tried at the next places, too: a stiff section that ends at a node of the mesh has a kink
+        there, and each step that changes its ends overturns the balance.
         """
         gradual = all(x.candidate.effect.gradual for x in each)
         known = [{}] if gradual else [{}, *_stiffnesses(near)]
@@ -160,23 +163,10 @@ class RelaxedStart:
             loose = cls._loose(near, each, values)
             if not any(loose._like(other) for other in apart):
                 apart.append(loose)
-        if gradual:
-            apart += [cls._loose(near, other, {}) for other in apart[0]._next_to_bounds()]
-        return min((x._strict() for x in apart), key=lambda x: x.left)._retried()
-
-    def _next_to_bounds(self) -> list[tuple[Screened, ...]]:
-        """The candidates with each one that has run to a bound at the next places.
-
-        A bound at which an effect vanishes is none: without force it may be anywhere.
-        """
-        unknowns, found = self.problem.unknowns, []
-        names = np.array(unknowns.names)[unknowns.at_bounds(self.values.theta)]
-        for i, x in enumerate(self.each):
-            nearby = {x.scan - 1, x.scan + 1} & {*range(len(x.candidate.scans))}
-            for k in nearby if np.isin(x.candidate.screened, names).any() else ():
-                moved = replace(x, start={**x.start, **x.candidate.scans[k]}, scan=k)
-                found.append((*self.each[:i], moved, *self.each[i + 1 :]))
-        return found
+        begun = [x._strict() for x in apart]
+        if gradual and not begun[0].moved:
+            begun += [cls._loose(near, other, {})._strict() for other in _at_next_places(each)]
+        return min(begun, key=lambda x: x.left)._retried()
 
     @classmethod
     def _loose(
@@ -214,8 +204,10 @@ class RelaxedStart:
     def _strict(self) -> RelaxedStart:
         """Follow a loosely relaxed start to a nearly strict balance, in its own parameters."""
         reached = relaxed(self.problem, self.values, COMPARED[1:-1])
+        moved = not np.array_equal(reached.theta, self.values.theta)
         problem, reached = _in_own_parameters(self.near, self.each, self.problem, reached)
-        return self._at(problem, relaxed(problem, reached, COMPARED[-1:]))
+        found = self._at(problem, relaxed(problem, reached, COMPARED[-1:]))
+        return replace(found, moved=moved)
 
     def _retried(self) -> RelaxedStart:
         """The start with other shapes tried for outlying poses."""
@@ -251,6 +243,16 @@ class RelaxedStart:
             return None
         loose = self._loose(self.near, self.each, {}, rolls=True)
         return loose._strict()._retried()
+
+
+def _at_next_places(each: tuple[Screened, ...]) -> list[tuple[Screened, ...]]:
+    """Candidates with one of them at the place before or after its own."""
+    found = []
+    for i, x in enumerate(each):
+        for k in {x.scan - 1, x.scan + 1} & {*range(len(x.candidate.scans))}:
+            moved = replace(x, start={**x.start, **x.candidate.scans[k]}, scan=k)
+            found.append((*each[:i], moved, *each[i + 1 :]))
+    return found
 
 
 def _as_measured(

@@ -61,18 +61,9 @@ class Unknowns:
 
     def off_bounds(self, theta: FloatArray) -> FloatArray:
         """Theta with each parameter that vanishes at a bound moved one typical change off it."""
-        return np.where(self._vanish & (theta <= self.bounds[0]), theta + 1, theta)
-
-    def at_bounds(self, theta: FloatArray) -> BoolArray:
-        """Entries (size,) of theta at a bound, other than one at which a parameter vanishes."""
-        lower, upper = self.bounds
-        return np.asarray((theta >= upper) | ((theta <= lower) & ~self._vanish))
-
-    @cached_property
-    def _vanish(self) -> BoolArray:
-        """Entries (size,) of theta that vanish at their lower bound."""
         vanish = [q.lower == q.nominal and not q.log for q in self._parameters]
-        return np.array(vanish + [False] * self.n_rest, dtype=bool)
+        own = np.array(vanish + [False] * self.n_rest, dtype=bool)
+        return np.where(own & (theta <= self.bounds[0]), theta + 1, theta)
 
     @property
     def without_prior(self) -> BoolArray:
