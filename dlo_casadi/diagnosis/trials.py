@@ -155,12 +155,13 @@ class Trials:
         best = max(tried, key=lambda item: item.fit.log_evidence, default=None)
         if best is None or not (best.candidate.effect.gradual and best.fit.beyond_noise):
             return tried
-        fit = refits.refit_from_shapes(self.declared, self.relaxed[0], best.screened)
-        if fit is None or fit.point.objective >= best.fit.point.objective:
-            return tried
-        found = Confirmed.of(best.screened, self.declared, fit)
-        self.refitted[best.name] = found
-        return [found if item is best and found else item for item in tried]
+        with suppress(EstimationError):  # lines that no relaxed shape follows
+            fit = refits.refit_from_shapes(self.declared, self.relaxed[0], best.screened)
+            found = Confirmed.of(best.screened, self.declared, fit)
+            if found and found.fit.point.objective < best.fit.point.objective:
+                self.refitted[best.name] = found
+                return [found if item is best else item for item in tried]
+        return tried
 
     def _simple_pairs(
         self, current: Fit, tried: Sequence[Confirmed], p_values: Mapping[str, float]
