@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -158,7 +157,10 @@ class Search:
 
     @property
     def may_be_far(self) -> bool:
-        """Whether a model that comes near the shapes may have begun too far from the effects."""
+        """Whether a search from the fit may begin too far from the effects.
+
+        A misfit's begins at the measured shapes anyway.
+        """
         return self.several and self.declared.noise.source != "misfit"
 
     def diagnosis(self) -> Diagnosis:
@@ -220,16 +222,22 @@ class Search:
         self, beginnings: Sequence[Beginning] | None = None, found: Found | None = None
     ) -> tuple[Found, UnknownForce | None]:
         """The best result of searches that begin in different ways, and the last unknown force."""
-        force = None
+        force, failed = None, None
         for beginning in beginnings or (*NEAR, SHAPES):
+            if found is None and beginning not in (NEAR[0], SHAPES):
+                continue  # they begin from what has been found
             if found is not None and not (self.goes_on and beginning.applies(self, found)):
                 continue
-            with suppress(EstimationError):
+            try:
                 search = beginning.begin(self, found)
                 force = search.force
                 result = search.run() if force is not None or beginning is not CAUSES else None
                 found = result if found is None else found.or_better(result, beginning.margin)
-        assert found is not None
+            except EstimationError as error:
+                failed = error
+        if found is None:
+            assert failed is not None
+            raise failed
         return found, force
 
     def may_gain(self, scattering: Fit) -> bool:
@@ -346,14 +354,14 @@ def _with_force(search: Search, found: Found | None) -> Search:
     return replace(search, force=estimate_unknown_force(start, search.trials.executor))
 
 
-# What scatters may bend the cable, as missing effects do; a model that does not even reach left-out
-# poses may have begun too far from the effect.
+# A scatter that bends the cable may hide a missing effect. If a model does not even reach left-out
+# poses, its search may have begun too far from the effect.
 SHAPES = Beginning(
     lambda search, found: search.may_be_far and (found.unexplained or bends_at_random(found.fit)),
     lambda search, _: search.beginning_with(from_shapes=True),
 )
 NEAR = (
-    Beginning(lambda _, found: found.unexplained or not found.added, lambda search, _: search),
+    Beginning(lambda *_: True, lambda search, _: search),
     Beginning(_noise_is_smaller, _under_its_noise),
     Beginning(_as_if_repeating, _repeating, EVIDENCE_APART),
     Beginning(_waves_may_hide_one, _on_a_line),

@@ -134,8 +134,8 @@ class RelaxedStart:
         Values before and after the relaxation.
     left : float
         Twice the objective; infinite while the balance is still soft.
-    moved : bool
-        Whether its unknowns changed while the balance hardened.
+    stuck : bool
+        Whether no step changed its unknowns as the balance hardened.
     """
 
     near: Fit
@@ -144,7 +144,7 @@ class RelaxedStart:
     begun: Values
     values: Values
     left: float = np.inf
-    moved: bool = True
+    stuck: bool = False
 
     @classmethod
     def of(cls, near: Fit, each: tuple[Screened, ...]) -> RelaxedStart:
@@ -152,9 +152,9 @@ class RelaxedStart:
 
         The stiffer a cable, the less a soft balance shows what pushes it up: with a contact, a
         stiffness that has grown a hundredfold never returns. Trials that reach the same minimum are
-        followed once. If no step lowers the objective once the balance hardens, candidates are
-        tried at the next places, too: a stiff section that ends at a node of the mesh has a kink
-        there, and each step that changes its ends overturns the balance.
+        followed once. If no step lowers the objective as the balance hardens, the candidates are
+        also tried at the next places: the objective has a kink where a stiff section ends at a node
+        of the mesh, and any step of its ends upsets the balance.
         """
         gradual = all(x.candidate.effect.gradual for x in each)
         known = [{}] if gradual else [{}, *_stiffnesses(near)]
@@ -164,7 +164,7 @@ class RelaxedStart:
             if not any(loose._like(other) for other in apart):
                 apart.append(loose)
         begun = [x._strict() for x in apart]
-        if gradual and not begun[0].moved:
+        if gradual and begun[0].stuck:
             begun += [cls._loose(near, other, {})._strict() for other in _at_next_places(each)]
         return min(begun, key=lambda x: x.left)._retried()
 
@@ -204,10 +204,10 @@ class RelaxedStart:
     def _strict(self) -> RelaxedStart:
         """Follow a loosely relaxed start to a nearly strict balance, in its own parameters."""
         reached = relaxed(self.problem, self.values, COMPARED[1:-1])
-        moved = not np.array_equal(reached.theta, self.values.theta)
+        stuck = np.array_equal(reached.theta, self.values.theta)
         problem, reached = _in_own_parameters(self.near, self.each, self.problem, reached)
         found = self._at(problem, relaxed(problem, reached, COMPARED[-1:]))
-        return replace(found, moved=moved)
+        return replace(found, stuck=stuck)
 
     def _retried(self) -> RelaxedStart:
         """The start with other shapes tried for outlying poses."""
@@ -246,12 +246,13 @@ class RelaxedStart:
 
 
 def _at_next_places(each: tuple[Screened, ...]) -> list[tuple[Screened, ...]]:
-    """Candidates with one of them at the place before or after its own."""
+    """Candidates with one of them at the scan before or after its own."""
     found = []
     for i, x in enumerate(each):
-        for k in {x.scan - 1, x.scan + 1} & {*range(len(x.candidate.scans))}:
-            moved = replace(x, start={**x.start, **x.candidate.scans[k]}, scan=k)
-            found.append((*each[:i], moved, *each[i + 1 :]))
+        for k in (x.scan - 1, x.scan + 1):
+            if 0 <= k < len(x.candidate.scans):
+                other = replace(x, start={**x.start, **x.candidate.scans[k]}, scan=k)
+                found.append((*each[:i], other, *each[i + 1 :]))
     return found
 
 

@@ -87,11 +87,11 @@ def near_data(
     singles and pairs of this matrix and of that at the base, as effects that rank low at one point
     rank high at the other; then, size by size, the shapes are relaxed with each of the best starts,
     and the best candidates by the Gram matrix there join it, as what one effect hides shows once
-    that one is there. If nothing comes near the noise the best starts are fitted at the end.
-    A contact, which has no score, is fitted first if its start leaves least; if it explains the
-    shapes, only single candidates are compared with it. Others are fitted if nothing explains the
-    shapes, unless their starts leave far more than the best one. If the best subset does not
-    explain the shapes, or only by a scatter, its end roll is searched again, then that of the next.
+    that one is there. If no fit explains the shapes, the best of the other starts are fitted at the
+    end. A contact, which has no score, is fitted first if its start leaves least; if it explains
+    the shapes, only single candidates are compared with it. Other contacts are fitted at the end,
+    unless their starts leave far more than the best one. If the best subset does not explain the
+    shapes, or only by a scatter, its end roll is searched again, then that of the next.
 
     Parameters
     ----------
@@ -113,12 +113,13 @@ def near_data(
     first_left = min((start.left for start in begun), default=np.inf)
 
     def touched(above: float, most: float) -> list[Confirmed]:
-        """Fits of the contacts whose starts leave more than the one and at most the other."""
-        kept = [start for start in begun[: len(contacts)] if above < start.left <= most]
-        return [x for x in map_in_order(executor, partial(confirm_contact, base), kept) if x]
+        """Fits of the contacts whose starts leave more than `above` and at most `most`."""
+        near_enough = [start for start in begun[: len(contacts)] if above < start.left <= most]
+        given = partial(confirm_contact, base), near_enough
+        return [x for x in map_in_order(executor, *given) if x]
 
     touching = touched(-np.inf, first_left)
-    explained = any(explains(item.fit) for item in touching)
+    explained = _any_explains(touching)
     least = first_left if explained else np.inf
     kept: list[RelaxedStart] = []
     tried: list[Confirmed] = []
@@ -146,7 +147,7 @@ def near_data(
             kept.extend(fitted)
             tried.extend(found)
             far.update({x: LESS_NEAR for y in close[len(fitted) : REFITTED] for x in y.names})
-        return any(explains(item.fit) for item in tried)
+        return _any_explains(tried)
 
     for subsets in stages():
         known = [start.names for start in starts]
@@ -154,10 +155,12 @@ def near_data(
         starts += map_in_order(executor, begin, new)
         if fit(last=False) or bound.met:
             break
-    if not (any(explains(item.fit) for item in tried) or (bound.met and tried)):
+    most = CLOSE * min((start.left for start in starts), default=np.inf)
+    if not (_any_explains(tried) or (bound.met and tried)):
         found = fit(last=True) or explained
-        most = CLOSE * min((start.left for start in starts), default=np.inf)
         touching += [] if found else touched(first_left, most)
+    beside = [start for start in begun[: len(contacts)] if start.left <= most]
+    far |= {name: LESS_NEAR for start in beside for name in start.names}
     screened = in_order([*(gram.singles if gram else ()), *contacts])
     tried = loads_from_best(base, screened, tried, executor)
     by_fit = {item.name: item.screened for item in touching}
@@ -193,6 +196,10 @@ def _names(each: Sequence[Screened]) -> set[str]:
 def _distinct(subsets: Sequence[tuple[Screened, ...]]) -> list[tuple[Screened, ...]]:
     """The first of each set of candidates."""
     return list({frozenset(_names(x)): x for x in reversed(subsets)}.values())[::-1]
+
+
+def _any_explains(tried: Sequence[Confirmed]) -> bool:
+    return any(explains(item.fit) for item in tried)
 
 
 def _near_least(

@@ -57,7 +57,7 @@ class Confirmed:
     Parameters
     ----------
     validation : CrossValidation or None
-        None if the base has more evidence: left-out poses are then no reason for it.
+        None if it has no more evidence than its base: it is refused, whatever they say.
     gain : float
         Decrease of twice the objective.
     beside : tuple of Screened
@@ -79,8 +79,8 @@ class Confirmed:
     ) -> Confirmed | None:
         """Compare the fit with a candidate, if there is one, with its base.
 
-        A fit that explains its points, but has not converged, goes on: else each fit without one of
-        its poses would do so.
+        A fit that explains its points but has not converged is continued: otherwise each fit
+        without one of its poses would have to do that.
         """
         if fit is None:
             return None
@@ -186,15 +186,16 @@ def scored_by_refit(
 def refit_from_shapes(base: Fit, near: Fit, screened: Screened, most: float = np.inf) -> Fit | None:
     """Fit with a candidate added, started at the measured shapes, with the base's weights.
 
-    `near`: the base relaxed there, see `from_data`. None without equilibria, or if the start leaves
-    `most` or more.
+    `near`: the base relaxed there, see `from_data`. None if a pose has no equilibrium, or if the
+    start leaves `most` or more.
     """
     begun = RelaxedStart.of(near, (screened,))
     fit = begun.fit() if begun.left < most else None
+    if fit is None:
+        return None
     with suppress(EstimationError):
-        if fit is not None:
-            same = fit.reweighed(base.noise, base.problem.priors)
-            return followed(same, screened.candidate.add_to(base.model), {})
+        same = fit.reweighed(base.noise, base.problem.priors)
+        return followed(same, screened.candidate.add_to(base.model), {})
     return None
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from math import comb, log
+from math import comb, log, prod
 from typing import Self
 
 import numpy as np
@@ -30,8 +30,9 @@ class AddedEffect:
     Parameters
     ----------
     p_value : float
-        p-value of the score test, corrected for places and candidates. If the noise is estimated,
-        the larger of this and of the test under the noise left once the effect is in the model.
+        Corrected for places and candidates. Of the score test; if the noise is estimated, the
+        larger of this and of the test under the noise left with the effect in the model. From the
+        measured shapes: of the evidence that all effects accepted together gain.
     before, after : CrossValidation
         Cross-validation without and with the effect.
     rivals : tuple of Confirmed
@@ -271,9 +272,10 @@ def with_new_noise(
     modes; otherwise the noise is too large and the significance too low.
 
     A refit that is weighed by its misfit stays so. If a refit has run away (no noise can be
-    estimated, or poses are lost), the base and 1 are returned. With `from_shapes` the gain in
-    evidence of a refit that explains the shapes is tested: a score at a soft balance may miss what
-    counts, and the base is too far from them for a test of likelihoods at equal weights.
+    estimated, or poses are lost), the base and 1 are returned. With `from_shapes`, a
+    refit that explains the shapes is tested by its gain in evidence instead: scores at a soft
+    balance may miss what counts, and the base is too far from the shapes for a test of likelihoods
+    at equal weights.
     """
     if winner.settled:
         return winner.fit, p_of(winner, winner.fit, base, len(p_values))
@@ -296,10 +298,20 @@ def with_new_noise(
 
 
 def p_of_evidence(item: Confirmed, fit: Fit, base: Fit, tried: int) -> float:
-    """Significance of what a refit's effects gain in evidence over a base of other weights."""
+    """Significance of what a refit's effects together gain over a base of other weights."""
     gain = 2 * (fit.log_evidence - base.log_evidence)
-    dof, degrees = len(item.candidate.frees), noise_degrees(fit)
-    return sidak(survival(gain, dof, degrees), tried * item.candidate.alike)
+    return _p_of_gain(item, gain, noise_degrees(fit), tried)
+
+
+def _p_of_gain(item: Confirmed, gain: float, degrees: float, tried: int) -> float:
+    """Probability that the best of all sets of as many candidates gains as much by chance."""
+    sets = comb(tried, len(item.each)) * prod(x.candidate.alike for x in item.each)
+    return sidak(survival(gain, _parameters(item), degrees), sets)
+
+
+def _parameters(item: Confirmed) -> int:
+    """Number of parameters of all effects of a refit."""
+    return sum(len(x.candidate.frees) for x in item.each)
 
 
 def p_under_new_noise(winner: Confirmed, fit: Fit, base: Fit, tried: int) -> float:
@@ -333,7 +345,7 @@ def p_of(item: Confirmed, fit: Fit, smaller: Fit, tried: int, *, settled: bool =
     parameters, for the likelihoods'.
     """
     gain = 2 * (smaller.point.objective - fit.point.objective)
-    dof, degrees = len(item.candidate.frees), noise_degrees(fit)
+    dof, degrees = _parameters(item), noise_degrees(fit)
     if settled and fit.scatters:
         try:
             gain = 2 * (fit.log_evidence - settle(smaller).log_evidence)
@@ -342,7 +354,7 @@ def p_of(item: Confirmed, fit: Fit, smaller: Fit, tried: int, *, settled: bool =
         if np.isfinite(degrees):
             # A larger exponent would overflow; its probability is zero anyway.
             gain = degrees * np.expm1(min(gain / (degrees + dof), 500.0))
-    return sidak(survival(max(gain, 0.0), dof, degrees), tried * item.candidate.alike)
+    return _p_of_gain(item, gain, degrees, tried)
 
 
 def support(item: Confirmed, base: Fit, validation: CrossValidation) -> float:

@@ -21,10 +21,7 @@ from dlo_casadi.diagnosis.from_data import from_data
 from dlo_casadi.diagnosis.gram import Gram, Screened, in_order, p_values_of, sidak, survival
 from dlo_casadi.diagnosis.near_data import near_data
 from dlo_casadi.diagnosis.refits import Confirmed, Tried
-from dlo_casadi.diagnosis.selection import (
-    AddedEffect,
-    decide,
-)
+from dlo_casadi.diagnosis.selection import AddedEffect, decide, shortcoming
 from dlo_casadi.diagnosis.structure import noise_degrees, screening_degrees
 from dlo_casadi.diagnosis.unknown_force import UnknownForce
 from dlo_casadi.effects import PointLoad, StateEffect
@@ -147,10 +144,10 @@ class Trials:
         return Tried(screened, p_values, [*tried, *pairs])
 
     def _at_shapes(self, tried: list[Confirmed]) -> list[Confirmed]:
-        """Refits; if the likeliest leaves more than noise, the better one of two starts of it.
+        """The refits; if the likeliest leaves more than noise, it is fitted from the shapes, too.
 
-        The second one is at the measured shapes. A softening has two minima where shapes tell
-        hardly more than the largest moment, and what the wrong one leaves looks like a load.
+        The better fit counts. A softening has two minima where shapes tell hardly more than the
+        largest moment, and what the wrong one leaves looks like a load.
         """
         best = max(tried, key=lambda item: item.fit.log_evidence, default=None)
         if best is None or not (best.candidate.effect.gradual and best.fit.beyond_noise):
@@ -169,19 +166,22 @@ class Trials:
         """Refits of pairs with no more parameters than a single candidate, which may stand for two.
 
         Both have to be significant beside one another, and to promise more than any single one.
-        What the likeliest single one lacks is found in the next step, beside all candidates.
+        Pairs with the likeliest single one are left out if that gains: what it lacks is found in
+        the next step, beside all candidates.
         """
         gram, n = self.gram_beside(current), len(p_values)
         if gram is None or not tried:
             return []
         most = max(len(item.candidate.frees) for item in tried)
         promised = max(item.screened.score for item in tried)
-        likeliest = max(tried, key=lambda item: item.fit.log_evidence).candidate
+        best = max(tried, key=lambda item: item.fit.log_evidence)
+        before = self.validation if current is self.declared else cross_validate(current)
+        alone = {best.name} if not shortcoming(best, current, before, self.doubt) else set()
         pairs = [
             pair
             for pair in gram.subsets(2, BEST)
             if sum(len(x.candidate.frees) for x in pair) <= most
-            and likeliest.name not in [x.candidate.name for x in pair]
+            and not any(x.candidate.name in alone for x in pair)
             and all(sidak(x.p_value, n) < self.significance for x in pair)
             and gram.gain(pair) > promised
         ]
@@ -269,7 +269,7 @@ def pruned(trials: Trials, fit: Fit, added: list[AddedEffect]) -> tuple[Fit, lis
         if not (compared and fit is accepted):
             before, after = cross_validate(smaller), cross_validate(fit)
         gain = 2 * (smaller.point.objective - fit.point.objective)
-        p_value = survival(max(gain, 0.0), len(effect.candidate.frees), screening_degrees(smaller))
+        p_value = survival(gain, len(effect.candidate.frees), screening_degrees(smaller))
         start = Screened(effect.candidate, gain, p_value, {})
         own = Confirmed(start, fit, after, gain, settled=True)
         others = not (compared or trials.bound.met)
@@ -311,7 +311,7 @@ def judged(
     if others and (effect.rivals or not misfits(smaller)):
         rivals = {effect.name, *(rival.name for rival in effect.rival_candidates)}
         asked = rivals if misfits(smaller) else {x.name for x in listed}
-        # Without derivative, a score is the gain of a refit: that of the effect is known.
+        # The score of an effect without derivative is the gain of a refit: that is known here.
         known_gain = [] if own.candidate.effect.gradual else [own.screened]
         asked -= {x.candidate.name for x in known_gain}
         screened = in_order([*trials.screened(smaller, asked), *known_gain])

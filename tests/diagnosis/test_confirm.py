@@ -11,6 +11,7 @@ from scipy.stats import chi2
 from dlo_casadi.diagnosis import refits
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.crossval import cross_validate
+from dlo_casadi.diagnosis.diagnose import NEAR, SHAPES, Search
 from dlo_casadi.diagnosis.gram import sidak
 from dlo_casadi.diagnosis.refits import Confirmed, refit_with, refit_without
 from dlo_casadi.diagnosis.screening import Screen, _Moving
@@ -19,6 +20,7 @@ from dlo_casadi.diagnosis.trials import Trials, judged
 from dlo_casadi.diagnosis.unknown_force import _Search
 from dlo_casadi.effects import EFFECTS, CableData, ClipOffset, LengthError, LumpedMass, UnknownPull
 from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import refit
 from dlo_casadi.estimation.fit import fit_model, refine_mesh
 from dlo_casadi.estimation.prediction import predict_poses
@@ -245,14 +247,38 @@ def test_the_offset_of_another_clip_replaces_a_first_one():
     assert judged(trials, own, base, before, effect) == (better, [effect])
 
 
-@pytest.mark.parametrize(("ahead", "significant"), [(5.0, False), (25.0, True)])
-def test_an_effect_has_to_explain_more_than_the_scatter_in_its_place(ahead, significant):
-    """With three parameters, of 18 candidates: a chi-square of 19 is one in 200 by chance."""
+@pytest.mark.parametrize(
+    ("ahead", "frees", "sets", "significant"),
+    [(5.0, ["abc"], 18, False), (25.0, ["abc"], 18, True), (12.0, ["abc", "d"], 153, False)],
+)
+def test_effects_have_to_explain_more_than_what_is_in_their_place(ahead, frees, sets, significant):
+    """Three parameters of one of 18 candidates: a chi-square of 19 is one in 200 by chance.
+
+    A pair is one of 153, and all its parameters count.
+    """
     scatter = SimpleNamespace(dof=np.inf)
     known = SimpleNamespace(slow_dof=np.inf)
     problem = SimpleNamespace(priors=SimpleNamespace(pose_scatter=scatter))
     fits = [SimpleNamespace(log_evidence=x, noise=known, problem=problem) for x in (ahead, 0.0)]
-    item = SimpleNamespace(candidate=SimpleNamespace(frees=("a", "b", "c"), alike=1))
-    p_value = p_of_evidence(item, *fits, 18)
-    assert p_value == pytest.approx(sidak(chi2.sf(2 * ahead, 3), 18), rel=1e-6)
+    each = [SimpleNamespace(candidate=SimpleNamespace(frees=x, alike=1)) for x in frees]
+    p_value = p_of_evidence(SimpleNamespace(each=each), *fits, 18)
+    dof = sum(map(len, frees))
+    assert p_value == pytest.approx(sidak(chi2.sf(2 * ahead, dof), sets), rel=1e-6)
     assert (p_value < SIGNIFICANCE) is significant
+
+
+def test_a_search_that_fails_leaves_it_to_that_from_the_measured_shapes(base, monkeypatch):
+    search = Search(Trials(base, None, (), SIGNIFICANCE, InProcess()), 4, lambda *_: None)
+    asked = []
+
+    def run(own):
+        asked.append(own.trials.from_shapes)
+        if not own.trials.from_shapes:
+            raise EstimationError("lost")
+        return "found"
+
+    monkeypatch.setattr(Search, "run", run)
+    assert search.best((*NEAR, SHAPES)) == ("found", None)
+    assert asked == [False, True]
+    with pytest.raises(EstimationError, match="lost"):
+        search.best(NEAR)

@@ -141,14 +141,14 @@ def test_the_effect_has_the_highest_score_and_is_fitted_to_the_noise(base, near,
     assert fit.chi2_per_dof < 1.3
 
 
-def test_a_start_that_does_not_move_is_tried_at_the_next_places(near, monkeypatch):
+def test_a_start_that_is_stuck_is_tried_at_the_next_places(near, monkeypatch):
     listed = candidates(near.model, setup_of(near.model, n_poses=6))
     section = next(x for x in listed if x.name == "stiff_section")
     asked, strict = [], RelaxedStart._strict
 
     def refused_at_first(start):
         asked.append(start.each[0].scan)
-        return replace(strict(start), moved=len(asked) > 1, left=1e3 + 10 * len(asked))
+        return replace(strict(start), stuck=len(asked) == 1, left=1e3 + 10 * len(asked))
 
     monkeypatch.setattr(RelaxedStart, "_strict", refused_at_first)
     screened = Screened(section, 0.0, 1.0, dict(section.scans[4]), scan=4)
