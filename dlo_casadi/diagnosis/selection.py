@@ -273,9 +273,8 @@ def with_new_noise(
 
     A refit that is weighed by its misfit stays so. If a refit has run away (no noise can be
     estimated, or poses are lost), the base and 1 are returned. With `from_shapes`, a
-    refit that explains the shapes is tested by its gain in evidence instead: scores at a soft
-    balance may miss what counts, and the base is too far from the shapes for a test of likelihoods
-    at equal weights.
+    refit that explains the shapes is tested by its gain in evidence: scores at a soft balance may
+    miss what counts, and the base is too far off for a test of likelihoods at equal weights.
     """
     if winner.settled:
         return winner.fit, p_of(winner, winner.fit, base, len(p_values))
