@@ -57,7 +57,7 @@ class Confirmed:
     Parameters
     ----------
     validation : CrossValidation or None
-        None if it has no more evidence than its base: it is refused, whatever they say.
+        Of left-out poses; None if it has no more evidence than its base, and so is refused anyway.
     gain : float
         Decrease of twice the objective.
     beside : tuple of Screened
