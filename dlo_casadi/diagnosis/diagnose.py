@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from dlo_casadi.diagnosis.candidates import equivalents
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
+from dlo_casadi.diagnosis.found import AddedEffect, Found, Ranked, likelier_by
 from dlo_casadi.diagnosis.from_pose_to_pose import (
     as_line,
     as_repeating,
@@ -19,14 +20,7 @@ from dlo_casadi.diagnosis.from_pose_to_pose import (
 )
 from dlo_casadi.diagnosis.gram import sidak, survival
 from dlo_casadi.diagnosis.if_hidden import IfHidden, if_hidden
-from dlo_casadi.diagnosis.selection import (
-    AddedEffect,
-    Found,
-    Ranked,
-    decide,
-    likelier_by,
-    ranking,
-)
+from dlo_casadi.diagnosis.selection import decide, ranking
 from dlo_casadi.diagnosis.structure import Structure, screening_degrees, structure_of
 from dlo_casadi.diagnosis.trials import Trials, pruned
 from dlo_casadi.diagnosis.unknown_force import UnknownForce, estimate_unknown_force
@@ -245,7 +239,8 @@ class Search:
         if not self.declared.converged:
             return True
         least = 2 * LEAST_PROMISED * (scattering.log_evidence - self.declared.log_evidence)
-        refitted = self.trials.tried(self.declared, largest=min(2, self.max_effects)).refits
+        given = self.declared, self.trials.validation
+        refitted = self.trials.tried(*given, largest=min(2, self.max_effects)).refits
         best = sorted(refitted, key=lambda item: -item.gain)[:1]
         return any(x.gain + y.score > least for x in best for y in self.trials.screened(x.fit))
 
@@ -261,7 +256,7 @@ class Search:
             if force is not None and not added:
                 tried = trials.tried_as_causes(force)
             else:
-                tried = trials.tried(current, largest=self.max_effects - len(added))
+                tried = trials.tried(current, validation, largest=self.max_effects - len(added))
             from_shapes = trials.starts_at_shapes(current)
             decision = decide(current, validation, tried, *trials.limits, from_shapes=from_shapes)
             if not ranked:

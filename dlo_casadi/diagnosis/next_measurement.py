@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.diagnosis.selection import AddedEffect, rivals_of
+from dlo_casadi.diagnosis.found import AddedEffect, rivals_of
 from dlo_casadi.equilibrium.curve import Observed
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.spread import Repeats

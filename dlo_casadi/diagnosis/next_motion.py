@@ -32,7 +32,7 @@ from typing import Self
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.diagnosis.selection import AddedEffect, rivals_of
+from dlo_casadi.diagnosis.found import AddedEffect, rivals_of
 from dlo_casadi.effects import MeasurementEffect
 from dlo_casadi.equilibrium.solve import solve_equilibria
 from dlo_casadi.errors import DloError, EquilibriumError

@@ -17,8 +17,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from dlo_casadi.diagnosis.candidates import Candidate, candidates, setup_of
+from dlo_casadi.diagnosis.found import AddedEffect, likelier_by, rivals_of
 from dlo_casadi.diagnosis.refits import load_instead
-from dlo_casadi.diagnosis.selection import AddedEffect, likelier_by, rivals_of
 from dlo_casadi.effects import Load, PointLoad
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import descend

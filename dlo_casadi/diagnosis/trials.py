@@ -17,11 +17,12 @@ import numpy as np
 from dlo_casadi.diagnosis import refits
 from dlo_casadi.diagnosis.candidates import Candidate, candidates_of
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
+from dlo_casadi.diagnosis.found import AddedEffect
 from dlo_casadi.diagnosis.from_data import from_data
 from dlo_casadi.diagnosis.gram import Gram, Screened, in_order, p_values_of, sidak, survival
 from dlo_casadi.diagnosis.near_data import near_data
 from dlo_casadi.diagnosis.refits import Confirmed, Tried
-from dlo_casadi.diagnosis.selection import AddedEffect, decide, shortcoming
+from dlo_casadi.diagnosis.selection import decide, shortcoming
 from dlo_casadi.diagnosis.structure import noise_degrees, screening_degrees
 from dlo_casadi.diagnosis.unknown_force import UnknownForce
 from dlo_casadi.effects import PointLoad, StateEffect
@@ -122,8 +123,8 @@ class Trials:
         return self.known_grams[-1][1] if len(self.known_grams) > before else None
 
     @accounted_as("candidates")
-    def tried(self, current: Fit, *, largest: int) -> Tried:
-        """Candidates screened and refitted beside the effects of a fit.
+    def tried(self, current: Fit, validation: CrossValidation, *, largest: int) -> Tried:
+        """Candidates screened and refitted beside the effects of a fit, which has this validation.
 
         `largest`: number of candidates that may be tried at once, see `near_data`.
         """
@@ -137,7 +138,8 @@ class Trials:
         if current is self.declared:
             tried = self._at_shapes(tried)
         p_values = p_values_of(screened)
-        pairs = self._simple_pairs(current, tried, p_values) if largest > 1 else []
+        beside = current, validation, tried, p_values
+        pairs = self._simple_pairs(*beside) if largest > 1 else []
         for x in (x for item in pairs for x in item.each):
             name = x.candidate.name
             p_values[name] = min(p_values[name], sidak(x.p_value, len(screened)))
@@ -152,7 +154,7 @@ class Trials:
         best = max(tried, key=lambda item: item.fit.log_evidence, default=None)
         if best is None or not (best.candidate.effect.gradual and best.fit.beyond_noise):
             return tried
-        with suppress(EstimationError):  # lines that no relaxed shape follows
+        with suppress(EstimationError):  # relaxed shapes may not reach the measured ones
             fit = refits.refit_from_shapes(self.declared, self.relaxed[0], best.screened)
             found = Confirmed.of(best.screened, self.declared, fit)
             if found and found.fit.point.objective < best.fit.point.objective:
@@ -161,13 +163,17 @@ class Trials:
         return tried
 
     def _simple_pairs(
-        self, current: Fit, tried: Sequence[Confirmed], p_values: Mapping[str, float]
+        self,
+        current: Fit,
+        validation: CrossValidation,
+        tried: Sequence[Confirmed],
+        p_values: Mapping[str, float],
     ) -> list[Confirmed]:
         """Refits of pairs with no more parameters than a single candidate, which may stand for two.
 
         Both have to be significant beside one another, and to promise more than any single one.
-        Pairs with the likeliest single one are left out if that gains: what it lacks is found in
-        the next step, beside all candidates.
+        Pairs with the likeliest single one are left out if that is better than the fit: what it
+        lacks is found in the next step, beside all candidates.
         """
         gram, n = self.gram_beside(current), len(p_values)
         if gram is None or not tried:
@@ -175,8 +181,7 @@ class Trials:
         most = max(len(item.candidate.frees) for item in tried)
         promised = max(item.screened.score for item in tried)
         best = max(tried, key=lambda item: item.fit.log_evidence)
-        before = self.validation if current is self.declared else cross_validate(current)
-        alone = {best.name} if not shortcoming(best, current, before, self.doubt) else set()
+        alone = {best.name} if not shortcoming(best, current, validation, self.doubt) else set()
         pairs = [
             pair
             for pair in gram.subsets(2, BEST)

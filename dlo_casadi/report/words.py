@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from dlo_casadi.diagnosis.selection import Ranked
+from dlo_casadi.diagnosis.found import Ranked
 from dlo_casadi.errors import counted
 from dlo_casadi.session.outcome import (
     MeasurementSummary,

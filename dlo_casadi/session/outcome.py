@@ -15,10 +15,10 @@ from dlo_casadi.cable.estimate import Estimate
 from dlo_casadi.cable.limits import LimitCheck
 from dlo_casadi.config import Config, Pose
 from dlo_casadi.diagnosis.diagnose import Verdict
+from dlo_casadi.diagnosis.found import Ranked
 from dlo_casadi.diagnosis.if_hidden import IfHidden
 from dlo_casadi.diagnosis.next_measurement import NextPose
 from dlo_casadi.diagnosis.next_motion import NextMotion
-from dlo_casadi.diagnosis.selection import Ranked
 from dlo_casadi.diagnosis.structure import Structure
 from dlo_casadi.diagnosis.unknown_force import UnknownForce
 from dlo_casadi.estimation.repeats import enough_poses, repeatability

@@ -10,12 +10,12 @@ import numpy as np
 
 from dlo_casadi.config import Config, declared_effects, declared_setup
 from dlo_casadi.diagnosis.diagnose import diagnose
+from dlo_casadi.diagnosis.found import AddedEffect
 from dlo_casadi.diagnosis.from_data import from_data
 from dlo_casadi.diagnosis.from_pose_to_pose import at_random, with_loose_poses
 from dlo_casadi.diagnosis.if_hidden import IfHidden, wider
 from dlo_casadi.diagnosis.next_measurement import separating_pose
 from dlo_casadi.diagnosis.next_motion import separating_motion
-from dlo_casadi.diagnosis.selection import AddedEffect
 from dlo_casadi.diagnosis.told_apart import among_rivals
 from dlo_casadi.errors import DloError, EstimationError
 from dlo_casadi.estimation.constrained import as_measured, profile_intervals, profiled

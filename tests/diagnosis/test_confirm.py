@@ -12,10 +12,11 @@ from dlo_casadi.diagnosis import refits
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.diagnosis.diagnose import NEAR, SHAPES, Search
+from dlo_casadi.diagnosis.found import AddedEffect
 from dlo_casadi.diagnosis.gram import sidak
 from dlo_casadi.diagnosis.refits import Confirmed, refit_with, refit_without
 from dlo_casadi.diagnosis.screening import Screen, _Moving
-from dlo_casadi.diagnosis.selection import AddedEffect, p_of_evidence
+from dlo_casadi.diagnosis.selection import p_of_evidence
 from dlo_casadi.diagnosis.trials import Trials, judged
 from dlo_casadi.diagnosis.unknown_force import _Search
 from dlo_casadi.effects import EFFECTS, CableData, ClipOffset, LengthError, LumpedMass, UnknownPull

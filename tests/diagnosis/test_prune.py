@@ -5,8 +5,8 @@ import pytest
 
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.crossval import cross_validate
+from dlo_casadi.diagnosis.found import AddedEffect
 from dlo_casadi.diagnosis.gram import sidak, survival
-from dlo_casadi.diagnosis.selection import AddedEffect
 from dlo_casadi.diagnosis.trials import Trials, pruned
 from dlo_casadi.effects import EFFECTS, CableData, ContactPlane
 from dlo_casadi.equilibrium.pose import HeldPose

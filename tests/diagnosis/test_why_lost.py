@@ -6,10 +6,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dlo_casadi.diagnosis import selection
+from dlo_casadi.diagnosis import found as findings
 from dlo_casadi.diagnosis.crossval import CrossValidation
+from dlo_casadi.diagnosis.found import Found, Ranked
 from dlo_casadi.diagnosis.refits import Confirmed
-from dlo_casadi.diagnosis.selection import Found, Ranked, choose, support
+from dlo_casadi.diagnosis.selection import choose, support
 
 COUNTS = np.full(6, 40.0)
 BASE = SimpleNamespace(log_evidence=100.0, model=SimpleNamespace(priors={}))
@@ -150,9 +151,9 @@ def test_a_search_that_explains_the_data_is_better_than_one_that_does_not():
 )
 def test_what_explains_the_data(error, p_noise, source, added, unexplained, monkeypatch):
     told = CrossValidation(np.full(2, error**2), np.ones(2), error, expected=1e-3)
-    monkeypatch.setattr(selection, "cross_validate", lambda _: told)
-    monkeypatch.setattr(selection, "structure_of", lambda *_: SimpleNamespace(p_noise=p_noise))
-    monkeypatch.setattr(selection, "noise_degrees", lambda _: np.inf)
+    monkeypatch.setattr(findings, "cross_validate", lambda _: told)
+    monkeypatch.setattr(findings, "structure_of", lambda *_: SimpleNamespace(p_noise=p_noise))
+    monkeypatch.setattr(findings, "noise_degrees", lambda _: np.inf)
     noise, problem = SimpleNamespace(source=source), SimpleNamespace(used=[0, 1])
     fit = SimpleNamespace(expected_error=5e-4, noise=noise, problem=problem)
     effects = ["one"] * added

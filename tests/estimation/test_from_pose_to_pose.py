@@ -11,6 +11,7 @@ from hidden_sets import simulated
 from dlo_casadi.cable.file import metadata_of
 from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.diagnosis.diagnose import Search
+from dlo_casadi.diagnosis.found import AddedEffect
 from dlo_casadi.diagnosis.from_data import from_data
 from dlo_casadi.diagnosis.from_pose_to_pose import (
     as_repeating,
@@ -18,7 +19,6 @@ from dlo_casadi.diagnosis.from_pose_to_pose import (
     with_loose_poses,
 )
 from dlo_casadi.diagnosis.refits import Confirmed, confirm
-from dlo_casadi.diagnosis.selection import AddedEffect
 from dlo_casadi.diagnosis.trials import Trials, judged
 from dlo_casadi.effects import EFFECTS, CableData
 from dlo_casadi.equilibrium.pose import HeldPose

@@ -19,7 +19,7 @@ from test_figures import EFFECT
 
 import dlo_casadi as dlo
 from dlo_casadi.cli import main
-from dlo_casadi.diagnosis.selection import Ranked
+from dlo_casadi.diagnosis.found import Ranked
 from dlo_casadi.effects.nuisances import EdgeBias
 from dlo_casadi.report.terminal import candidate_table
 

@@ -9,7 +9,7 @@ from matplotlib.image import imread
 
 from dlo_casadi.cable.estimate import Estimate
 from dlo_casadi.cable.picture import draw_shape
-from dlo_casadi.diagnosis.selection import Ranked
+from dlo_casadi.diagnosis.found import Ranked
 from dlo_casadi.diagnosis.unknown_force import UnknownForce
 from dlo_casadi.report import figures, figures_poses
 from dlo_casadi.report.figures_poses import write_overlays

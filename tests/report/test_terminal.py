@@ -11,7 +11,7 @@ from test_figures import EFFECT, LOAD
 from test_page import MOTION, PROPOSAL
 
 from dlo_casadi.cable.estimate import Estimate
-from dlo_casadi.diagnosis.selection import Ranked
+from dlo_casadi.diagnosis.found import Ranked
 from dlo_casadi.diagnosis.structure import LARGEST_SCORE, Structure
 from dlo_casadi.report.findings import RESIDUAL, separation_text
 from dlo_casadi.report.page_pictures import pictures
