@@ -51,7 +51,10 @@ class Telling:
 def telling(fit: Fit, other: Fit) -> Telling | None:
     """The measurement that separates two fits of the same poses; None without their shapes."""
     poses = [item.pose for item in fit.problem.fit_poses]
-    shapes = (predict_each(one.model, one.p, one.rest_now, poses) for one in (fit, other))
+    shapes = (
+        predict_each(one.model, one.p, one.rest_now, poses, [*one.point.shapes.x[one.problem.used]])
+        for one in (fit, other)
+    )
     pairs = [(a, b) for a, b in zip(*shapes, strict=True) if a is not None and b is not None]
     if not pairs:
         return None

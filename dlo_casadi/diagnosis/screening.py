@@ -12,6 +12,7 @@ function theorem, exact from CasADi.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -88,15 +89,17 @@ def _scan(candidates: Sequence[Candidate], k: int) -> dict[str, float]:
 
 
 def _moved_together(listed: Sequence[Candidate], k: int) -> list[list[Candidate]]:
-    """Groups of candidates that share a model: at scan 0 all, then those that have a k-th scan.
+    """Groups of candidates that share a model, of those that have a k-th scan.
 
-    Effects on the state act through all later poses, which costs more: they have their own model.
+    What a model costs grows faster than the number of its effects. Those with several scans are
+    moved together; effects on the state, which act through all later poses, are apart.
     """
-    if k == 0:
-        return [list(listed)] if listed else []
-    several = [c for c in listed if len(c.scans) > 1]
-    apart = ([c for c in several if isinstance(c.effect, StateEffect) == s] for s in (False, True))
-    return [group for group in apart if any(k < len(c.scans) for c in group)]
+    kinds = itertools.product((False, True), repeat=2)
+    groups = (
+        [c for c in listed if (isinstance(c.effect, StateEffect), len(c.scans) > 1) == kind]
+        for kind in kinds
+    )
+    return [group for group in groups if any(k < len(c.scans) for c in group)]
 
 
 # Whitened columns (R_j, q) of each pose, by the label of the candidate and its scan.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
@@ -10,12 +11,15 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.effects import MeasurementEffect
-from dlo_casadi.equilibrium.equilibrium import Equilibrium
+from dlo_casadi.equilibrium.equilibrium import Equilibrium, equilibria_of
+from dlo_casadi.equilibrium.minima import KEEPING_SIDE, descend_to_contact
 from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.equilibrium.solve import solve_equilibrium
+from dlo_casadi.equilibrium.spans import nothing_found
 from dlo_casadi.equilibrium.spread import Uncertainty
 from dlo_casadi.errors import DloError
+from dlo_casadi.model.assembly import Assembly
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.stacked import Inputs
 from dlo_casadi.motion.anchors import Anchors
 from dlo_casadi.motion.modes import DampedModes, damped_modes, displacements
 from dlo_casadi.motion.state import State
@@ -91,10 +95,11 @@ class ModesAtRest:
 
     def std(self, known: Uncertainty) -> FloatArray:
         """Standard deviations (2, count) of `numbers` under a fit's covariance, to first order."""
+        ways = directions(self.model, known)
         total = np.zeros((2, self.count))
-        for p, rest in directions(self.model, known):
-            ahead, behind = (self.moved(way * p, way * rest).numbers() for way in (0.5, -0.5))
-            total += (ahead - behind) ** 2
+        both = (self.moved([(h * p, h * rest) for p, rest in ways]) for h in (0.5, -0.5))
+        for ahead, behind in zip(*both, strict=True):
+            total += (ahead.numbers() - behind.numbers()) ** 2
         return np.sqrt(total)
 
     def displacements(self, s: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -105,11 +110,32 @@ class ModesAtRest:
         moving, state, found = self.state
         return displacements(moving, state, found.vectors, s)
 
-    def moved(self, p: FloatArray, rest: FloatArray) -> Self:
-        """Those of the cable with changed parameters and rest strains, in the same pose."""
-        p, rest = self.p + p, self.rest + rest
-        own = solve_equilibrium(self.model, p, rest, self.pose, x_init=self.equilibrium.x)
-        return replace(self, p=p, rest=rest, equilibrium=own)
+    def moved(self, ways: Sequence[tuple[FloatArray, FloatArray]]) -> list[Self]:
+        """Those of the cable with changed parameters and rest strains, in the same pose.
+
+        Raises
+        ------
+        EquilibriumError
+            If the cable finds no equilibrium near its shape.
+        """
+        if not ways:
+            return []
+        model, pose = self.model, self.pose
+        p, rest = (
+            np.array([own + x for x in each])
+            for own, each in zip((self.p, self.rest), zip(*ways, strict=True), strict=True)
+        )
+        shapes = self.equilibrium.shapes.subset(np.zeros(len(ways), dtype=int))
+        start = Assembly(model, shapes, Inputs(p, rest, np.tile(pose.vector, (len(ways), 1))))
+        found = descend_to_contact(start, KEEPING_SIDE)
+        if not found.balanced.all():
+            raise nothing_found(model, pose, "a nearby shape")
+        each = equilibria_of(
+            replace(start, shapes=found.shapes),
+            stable=found.converged,
+            iterations=found.iterations,
+        )
+        return [replace(self, p=p[k], rest=rest[k], equilibrium=one) for k, one in enumerate(each)]
 
 
 def directions(model: CableModel, known: Uncertainty) -> list[tuple[FloatArray, FloatArray]]:
