@@ -14,7 +14,6 @@ from dlo_casadi.diagnosis.from_pose_to_pose import (
     as_line,
     as_repeating,
     at_random,
-    bends_at_random,
     few_places,
     with_loose_poses,
 )
@@ -349,10 +348,9 @@ def _with_force(search: Search, found: Found | None) -> Search:
     return replace(search, force=estimate_unknown_force(start, search.trials.executor))
 
 
-# A scatter that bends the cable may hide a missing effect. If a model does not even reach left-out
-# poses, its search may have begun too far from the effect.
+# If nothing explains the data, the search may have begun too far from the effect.
 SHAPES = Beginning(
-    lambda search, found: search.may_be_far and (found.unexplained or bends_at_random(found.fit)),
+    lambda search, found: search.may_be_far and found.unexplained,
     lambda search, _: search.beginning_with(from_shapes=True),
 )
 NEAR = (

@@ -50,12 +50,6 @@ def few_places(fit: Fit) -> bool:
     return 1 + int((np.diff(places) > MARKERS_APART * length).sum()) <= FEW
 
 
-def bends_at_random(fit: Fit) -> bool:
-    """Whether something differs at random that bends the cable, or a rival: `PoseScatter.bends`."""
-    scatter = fit.problem.priors.pose_scatter
-    return scatter.std > 0 and any(one.bends for one in (scatter, *scatter.rivals))
-
-
 @accounted_as("loose poses")
 def with_loose_poses(misfit: Fit, near: Fit, finest: int | None = None) -> Fit | None:
     """Fit, started at relaxed shapes, in which something other than the shape at rest is random.

@@ -70,11 +70,6 @@ class PoseScatter:
         kind = random_effects().get(self.source)
         return kind is not None and kind.per_stiffness
 
-    @property
-    def bends(self) -> bool:
-        """Whether it bends the cable, so that a missing effect may look like it."""
-        return self.source == REST_CURVATURE or self.of_moments
-
     def most(self, model: CableModel) -> float:
         """Largest `std` that counts as a scatter, see MOST_BEND."""
         return MOST_BEND / model.cable.length if self.source == REST_CURVATURE else np.inf

@@ -15,7 +15,6 @@ from dlo_casadi.diagnosis.found import AddedEffect
 from dlo_casadi.diagnosis.from_data import from_data
 from dlo_casadi.diagnosis.from_pose_to_pose import (
     as_repeating,
-    bends_at_random,
     with_loose_poses,
 )
 from dlo_casadi.diagnosis.refits import Confirmed, confirm
@@ -202,7 +201,6 @@ def test_clamps_that_turn_in_a_misfit_are_found_from_the_shapes(misfit, near):
     assert fit.noise.source == "misfit"
     own = near.problem.priors.pose_scatter
     assert own.source == "clamp_rotation"
-    assert not bends_at_random(near)
     assert own.std == pytest.approx(found.values["random.clamp_rotation"], rel=0.2)
     assert near.chi2_per_dof == pytest.approx(1.0, abs=0.15)
     interval = profile_interval(near)
@@ -267,15 +265,6 @@ def test_a_kept_mesh_is_that_of_the_misfit(misfit, shapes, near):
     fit = misfit[1]
     finer = SimpleNamespace(model=fit.model.with_mesh(near.model.n + 2))
     assert with_loose_poses(finer, shapes).model.n == near.model.n + 2
-
-
-def test_a_scatter_may_be_of_the_rest_shape_if_a_rival_is(near):
-    own = near.problem.priors.pose_scatter
-    for rival, expected in (("end_offset", False), (REST_CURVATURE, True)):
-        scatter = replace(own, rivals=(PoseScatter(0.01, source=rival),))
-        priors = SimpleNamespace(pose_scatter=scatter)
-        both = SimpleNamespace(problem=SimpleNamespace(priors=priors), model=near.model)
-        assert bends_at_random(both) is expected
 
 
 def test_simulated_shapes_do_not_depend_on_the_mesh_that_the_simulation_starts_with(monkeypatch):
