@@ -106,6 +106,8 @@ def by_ipopt(
     given = Inputs.of(p, rest, pose.vector[None])
     now, iterations = Assembly(model, Shapes(phi[None, :, None], border[None], still), given), 0
     for _ in range(NODE_CHANGES if model.sliding else 1):
+        if (np.diff(now.clipped.places[0]) <= 0).any():
+            return None  # an eyelet has slid past another clip
         there, bounded, count = _minimised(now)
         iterations += count
         now = replace(there, shapes=slid(there, there.shapes)) if model.sliding else there
