@@ -234,6 +234,14 @@ def test_ipopt_finds_the_same_minimum(second):
     assert eq.energy == pytest.approx(min(energies), rel=1e-9)
 
 
+def test_ipopt_gives_up_where_a_guess_is_at_an_eyelet_beyond_the_next_clip():
+    clips = (HeldClip("eyelet", (0.6, 0.0)), HeldClip("pinned", (0.3, 0.0), 0.4))
+    model = CableModel(CABLE, 20, n_rest=0, clips=tuple(clip.kind for clip in clips))
+    pose = HeldPose((0.0, 0.0), (0.8, 0.0), clips=clips)
+    straight, rest = np.zeros(model.chain.n_nodes), np.zeros(model.chain.n_rests)
+    assert by_ipopt(model, model.nominal, rest, pose, straight) is None
+
+
 def test_ipopts_statement_in_space_has_the_same_energy_and_conditions():
     """Through a swivel, whose frame rolls with the cable, and an eyelet."""
     model, pose, eq = solved(
