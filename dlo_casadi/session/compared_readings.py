@@ -138,16 +138,18 @@ class ComparedReading(Reading):
     def _free(self) -> FloatArray:
         """Directions (m c, k), orthonormal, in which the shapes hardly determine the readings.
 
-        Across the model itself, whose scale is always free; those of more than MISREAD of its size.
+        Those that change them by more than MISREAD of the model's size, across the model itself,
+        whose scale is always free. Their parts along the model count, too: a rest curvature between
+        pins may turn the sum of all forces round, and leaves the sign of its weight's part.
         """
         model = self.model.ravel()
         if self.uncertain is None or not model.any():
             return np.zeros((len(model), 0))
         along, size = model / np.linalg.norm(model), np.linalg.norm(model)
         ways = self.uncertain.reshape((len(model), -1))
-        ways = ways - np.outer(along, along @ ways)
-        left, values, _ = np.linalg.svd(ways, full_matrices=False)
-        return np.asarray(left[:, values > MISREAD * size])
+        across = ways - np.outer(along, along @ ways)
+        _, values, right = np.linalg.svd(across, full_matrices=False)
+        return np.linalg.qr(ways @ right[values > MISREAD * size].T)[0]
 
     def judged(self, readings: FloatArray) -> FloatArray:
         """The part (m c, ...) of readings (m, c, ...) that the shapes determine up to a scale."""
