@@ -249,8 +249,30 @@ def followed(
 ) -> Fit | None:
     """Refit of a model with new parameters at these values; None without equilibria."""
     with suppress(EstimationError):
-        return refit(start, model, values=values, tolerance=NEARLY, ceiling=ceiling)
+        begun, values = _in_linear(start, model, values, ceiling)
+        return refit(begun, model, values=values, tolerance=NEARLY, ceiling=ceiling)
     return None
+
+
+def _in_linear(
+    start: Fit, model: CableModel, values: Mapping[str, float], ceiling: float
+) -> tuple[Fit, Mapping[str, float]]:
+    """A fit of new effects in parameters without a curved valley, and their own values there."""
+    known, cable = {effect.label for effect in start.model.effects}, model.cable
+    for effect in (x for x in model.effects if x.label not in known):
+        prefix, each = f"{effect.label}.", effect.parameters(cable)
+        given = effect.in_linear({q.name: values.get(prefix + q.name, q.nominal) for q in each})
+        if given is None:
+            continue
+        linear = effect.linear()
+        other = replace(model, effects=tuple(linear if x is effect else x for x in model.effects))
+        given = {**values, **{prefix + name: value for name, value in given.items()}}
+        start = refit(start, other, values=given, tolerance=NEARLY, ceiling=ceiling)
+        names = (q.name for q in linear.parameters(cable))
+        own = effect.of_linear(cable, {name: start.value(prefix + name) for name in names})
+        clipped = {q.name: float(np.clip(own[q.name], q.lower, q.upper)) for q in each}
+        values = {**values, **{prefix + name: value for name, value in clipped.items()}}
+    return start, values
 
 
 def refit_with(base: Fit, *each: Screened, ceiling: float = np.inf) -> Fit | None:

@@ -236,8 +236,7 @@ class Trials:
         leading = sorted(significant, key=lambda item: -item.score)[:REFITTED]
         worthy = [item for item in leading if item.score >= WORTH * leading[0].score]
         new = [item for item in worthy if item.candidate.name not in known]
-        among = [known.get(item.candidate.name) for item in worthy]
-        ceiling = min((refits.ceiling_beside(x.fit) for x in among if x), default=np.inf)
+        ceiling = min((refits.ceiling_beside(x.fit) for x in known.values() if x), default=np.inf)
         confirm = partial(refits.confirm, current, ceiling=ceiling, beside=beside)
         found = map_in_order(self.executor, confirm, new)
         known.update(zip((item.candidate.name for item in new), found, strict=True))

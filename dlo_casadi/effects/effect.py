@@ -189,6 +189,13 @@ class Effect:
         """Convert parameters of `linear` to those of this effect."""
         return dict(values)
 
+    def in_linear(self, values: Mapping[str, float]) -> dict[str, float] | None:
+        """Convert parameters of this effect to those of `linear`; None if it is fitted in its own.
+
+        Only where its own parameters have a curved valley, along which a fit takes long.
+        """
+        return None
+
 
 class SectionLaw(Effect):
     """Kind `section`: how much the section resists. Section laws multiply.
