@@ -386,6 +386,7 @@ def test_a_soft_tether_to_a_far_anchor_is_a_point_force():
     assert np.hypot(far["anchor_x"], far["anchor_y"]) == pytest.approx(10 * CABLE.length)
     near = effect.of_linear(CABLE, {"stiffness": 2.0, **force})
     assert (near["anchor_x"], near["anchor_y"]) == pytest.approx((-0.3, 0.4))
+    assert effect.in_linear(near) == pytest.approx({"stiffness": 2.0, **force})
     pose = HeldPose((0.0, 0.0), (0.5, 0.1))
 
     def nodes(effect, values):
