@@ -49,12 +49,12 @@ class Telling:
 
 
 def telling(fit: Fit, other: Fit) -> Telling | None:
-    """The measurement that separates two fits of the same poses; None without their shapes."""
+    """The measurement that separates two fits of the same poses; None without their shapes.
+
+    The shapes are those on the measured branches, or predicted where none is found there.
+    """
     poses = [item.pose for item in fit.problem.fit_poses]
-    shapes = (
-        predict_each(one.model, one.p, one.rest_now, poses, [*one.point.shapes.x[one.problem.used]])
-        for one in (fit, other)
-    )
+    shapes = (_near(one, poses) for one in (fit, other))
     pairs = [(a, b) for a, b in zip(*shapes, strict=True) if a is not None and b is not None]
     if not pairs:
         return None
@@ -62,6 +62,17 @@ def telling(fit: Fit, other: Fit) -> Telling | None:
     best = max(range(len(pairs)), key=lambda k: readings[k].separation)
     turned = (None, None) if fit.model.end.place else _pose_that_tells(fit, other)
     return Telling(pairs[best][0].pose.name, readings[best], *turned)
+
+
+def _near(fit: Fit, poses: Sequence[HeldPose]) -> list[Prediction | None]:
+    """Predictions of a fit's poses, from the fitted shapes where that leads to an equilibrium."""
+    given, starts = (fit.model, fit.p, fit.rest_now), fit.point.shapes.x[fit.problem.used]
+    found = predict_each(*given, poses, [*starts])
+    lost = [k for k, one in enumerate(found) if one is None]
+    again = predict_each(*given, [poses[k] for k in lost]) if lost else []
+    for k, one in zip(lost, again, strict=True):
+        found[k] = one
+    return found
 
 
 def _pose_that_tells(fit: Fit, other: Fit) -> tuple[float | None, float | None]:

@@ -49,8 +49,8 @@ ASIDE, ASIDE_HELD = 0.25, 0.05
 DURATION, RATE, POINTS = 3.0, 100.0, 10
 # Share of the slowest rate of a cable below which nothing holds a mode.
 FREE = 0.05
-# Modes that are compared, and poses that are tried at most: of 12 the one whose rates differ most
-# separated rivals no better in six of eight cases, of simulated sessions.
+# Modes that are compared, and poses that are tried at most. Of 12 poses the one whose rates differ
+# most separated rivals no better than that of 4 in six of eight simulated sessions.
 MODES, TRIED = 3, 4
 
 
@@ -111,7 +111,7 @@ def separating_motion(fit: Fit, added: Sequence[AddedEffect]) -> NextMotion | No
 
 
 def next_motion(fit: Fit, others: Mapping[str, Fit], of: str = "") -> NextMotion | None:
-    """The let-go that separates a fit from rivals, in the measured pose in which it does best.
+    """The let-go that separates a fit from rivals, in one of TRIED measured poses.
 
     Rivals whose motion is not known are left out: those with other effects of the camera. None
     without any, and where motion does not know a part of the cable, such as obstacles.

@@ -247,10 +247,14 @@ def followed(
     values: Mapping[str, float],
     ceiling: float = np.inf,
 ) -> Fit | None:
-    """Refit of a model with new parameters at these values; None without equilibria."""
-    with suppress(EstimationError):
-        begun, values = _in_linear(start, model, values, ceiling)
-        return refit(begun, model, values=values, tolerance=NEARLY, ceiling=ceiling)
+    """Refit of a model with new parameters at these values; None without equilibria.
+
+    New effects are first fitted in parameters without a curved valley, if that succeeds.
+    """
+    ways = [_in_linear(start, model, values, ceiling), (start, values)]
+    for begun, given in ways if ways[0][0] is not start else ways[1:]:
+        with suppress(EstimationError):
+            return refit(begun, model, values=given, tolerance=NEARLY, ceiling=ceiling)
     return None
 
 
@@ -264,13 +268,19 @@ def _in_linear(
         given = effect.in_linear({q.name: values.get(prefix + q.name, q.nominal) for q in each})
         if given is None:
             continue
-        linear = effect.linear()
+        # Of another label, so that no value of the effect itself is taken from this fit.
+        linear = replace(effect.linear(), label=f"{effect.label}_linear")
+        of_linear = f"{linear.label}."
         other = replace(model, effects=tuple(linear if x is effect else x for x in model.effects))
-        given = {**values, **{prefix + name: value for name, value in given.items()}}
-        start = refit(start, other, values=given, tolerance=NEARLY, ceiling=ceiling)
+        given = {**values, **{of_linear + name: value for name, value in given.items()}}
+        try:
+            found = refit(start, other, values=given, tolerance=NEARLY, ceiling=ceiling)
+        except EstimationError:
+            continue
         names = (q.name for q in linear.parameters(cable))
-        own = effect.of_linear(cable, {name: start.value(prefix + name) for name in names})
+        own = effect.of_linear(cable, {name: found.value(of_linear + name) for name in names})
         clipped = {q.name: float(np.clip(own[q.name], q.lower, q.upper)) for q in each}
+        start = found
         values = {**values, **{prefix + name: value for name, value in clipped.items()}}
     return start, values
 

@@ -91,8 +91,8 @@ def _scan(candidates: Sequence[Candidate], k: int) -> dict[str, float]:
 def _moved_together(listed: Sequence[Candidate], k: int) -> list[list[Candidate]]:
     """Groups of candidates that share a model, of those that have a k-th scan.
 
-    What a model costs grows faster than the number of its effects. Those with several scans are
-    moved together; effects on the state, which act through all later poses, are apart.
+    What a model costs grows faster than the number of its effects, so there are up to four: effects
+    on the state, which act through all later poses, and others, of one scan and of several.
     """
     kinds = itertools.product((False, True), repeat=2)
     groups = (

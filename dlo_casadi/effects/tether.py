@@ -64,10 +64,9 @@ class Tether(PointLoad):
         return {"stiffness": stiffness, "position": values["position"], **anchor}
 
     def in_linear(self, values: Mapping[str, float]) -> dict[str, float]:
-        """Stiffness, place and force f = k a: the valley of a force, a + 1 / k, is a line in them.
+        """Stiffness, place and force f = k a.
 
-        In a session with a strap 83 steps in k and a ended far from the minimum that 9 steps in k
-        and f reached.
+        Tethers of the same force f0 at r have a = r + f0 / k, a curve; f = f0 + k r is a line.
         """
         k = values["stiffness"]
         forces = {name[-1]: k * a for name, a in values.items() if name.startswith("anchor_")}

@@ -107,7 +107,7 @@ def by_ipopt(
     now, iterations = Assembly(model, Shapes(phi[None, :, None], border[None], still), given), 0
     for _ in range(NODE_CHANGES if model.sliding else 1):
         if (np.diff(now.clipped.places[0]) <= 0).any():
-            return None  # an eyelet has slid past another clip
+            return None  # the guess, or a slide, puts an eyelet beyond the next clip
         there, bounded, count = _minimised(now)
         iterations += count
         now = replace(there, shapes=slid(there, there.shapes)) if model.sliding else there

@@ -12,7 +12,7 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.effects import MeasurementEffect
 from dlo_casadi.equilibrium.equilibrium import Equilibrium, equilibria_of
-from dlo_casadi.equilibrium.minima import KEEPING_SIDE, descend_to_contact
+from dlo_casadi.equilibrium.minima import descend, kept_by
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.spans import nothing_found
 from dlo_casadi.equilibrium.spread import Uncertainty
@@ -113,10 +113,12 @@ class ModesAtRest:
     def moved(self, ways: Sequence[tuple[FloatArray, FloatArray]]) -> list[Self]:
         """Those of the cable with changed parameters and rest strains, in the same pose.
 
+        `ways`: changes of p (n_parameters,) and of the rest strains (n_rests,) [1/m].
+
         Raises
         ------
         EquilibriumError
-            If the cable finds no equilibrium near its shape.
+            If the cable does not stay in an equilibrium near its shape.
         """
         if not ways:
             return []
@@ -127,8 +129,8 @@ class ModesAtRest:
         )
         shapes = self.equilibrium.shapes.subset(np.zeros(len(ways), dtype=int))
         start = Assembly(model, shapes, Inputs(p, rest, np.tile(pose.vector, (len(ways), 1))))
-        found = descend_to_contact(start, KEEPING_SIDE)
-        if not found.balanced.all():
+        found = descend(start)
+        if not kept_by(start, found).all():
             raise nothing_found(model, pose, "a nearby shape")
         each = equilibria_of(
             replace(start, shapes=found.shapes),

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.rod.quantities import Quantity, quantity_of
 from dlo_casadi.session.axes import NEAR_AXES, exchanges, listed
-from dlo_casadi.thresholds import FITTED_READINGS, MISREAD
+from dlo_casadi.thresholds import FITTED_READINGS, MISREAD, UNSEEN
 
 
 @dataclass(frozen=True)
@@ -139,8 +139,8 @@ class ComparedReading(Reading):
         """Directions (m c, k), orthonormal, in which the shapes hardly determine the readings.
 
         Those that change them by more than MISREAD of the model's size, across the model itself,
-        whose scale is always free. Their parts along the model count, too: a rest curvature between
-        pins may turn the sum of all forces round, and leaves the sign of its weight's part.
+        whose scale is always free. Their part along the model counts, too, if two standard
+        deviations may turn its sign: a rest curvature between pins adds forces along the chord.
         """
         model = self.model.ravel()
         if self.uncertain is None or not model.any():
@@ -149,7 +149,10 @@ class ComparedReading(Reading):
         ways = self.uncertain.reshape((len(model), -1))
         across = ways - np.outer(along, along @ ways)
         _, values, right = np.linalg.svd(across, full_matrices=False)
-        return np.linalg.qr(ways @ right[values > MISREAD * size].T)[0]
+        free = right[values > MISREAD * size].T
+        parts = along @ ways @ free
+        turning = np.where(UNSEEN * np.abs(parts) > size, parts, 0.0)
+        return np.linalg.qr(across @ free + np.outer(along, turning))[0]
 
     def judged(self, readings: FloatArray) -> FloatArray:
         """The part (m c, ...) of readings (m, c, ...) that the shapes determine up to a scale."""

@@ -128,15 +128,13 @@ class _Run:
         compared = begin(executor, fitting.simpler_fits, *others)
         with part("declared model"):
             fit = fitting.fit_declared(config, declared, measured)
-        diagnosed = config.diagnosis.enabled
-        # IPOPT confirms the fit that is reported, and goes on where a descent has stopped.
-        asked = not (diagnosed and fit.converged)
-        confirming = begin(executor, fitting.minimum_by_ipopt, fit) if asked else None
+        confirming = begin(executor, fitting.minimum_by_ipopt, fit)
         step("fit the declared model", 1, 1)
 
         step("compare with simpler fits", 0, 1)
         effects = declared_effects(config, declared_setup(config))
         reported = _parameters_of({effect.label for _, effect in effects}, fit.model)
+        diagnosed = config.diagnosis.enabled
 
         def staged(fit: Fit) -> Stage:
             # Intervals follow the diagnosis: a model that does not explain the points gets none.
@@ -226,10 +224,11 @@ class _Run:
         unknown = diagnosis.unexplained and not diagnosis.added
         fit = nearest if unknown and nearest is not declared else diagnosis.fit
         fit = self.meshed(fit, SETTLED_MODES)
-        confirming = None if unknown else begin(self.executor, fitting.minimum_by_ipopt, fit)
+        confirming = (
+            begin(self.executor, fitting.minimum_by_ipopt, fit) if diagnosis.added else None
+        )
         next_pose = separating_pose(diagnosis.fit, diagnosis.added)
         moved = None if self.motions else separating_motion(diagnosis.fit, diagnosis.added)
-        best = self.confirmed(fit, confirming)
         if diagnosis.unexplained or (nearest.noise.source == "misfit" and diagnosis.added):
             stages[-1] = _marked(stages[-1], explains=False)
         elif diagnosis.added:
@@ -237,14 +236,17 @@ class _Run:
             stages[-1] = replace(stages[-1], parameters=parameters)
         else:
             # Nothing is missing: estimate the declared model's noise as that of a complete one.
-            best = as_measured(best)
-            stages[-1] = fit_stage("batch", best, measured, profile_intervals(best), reported)
-        if diagnosis.added:
+            fit = as_measured(fit)
+            stages[-1] = fit_stage("batch", fit, measured, profile_intervals(fit), reported)
+        if confirming is not None:
             labels = {item.candidate.effect.label for item in diagnosis.added}
             names = [*reported, *_parameters_of(labels, fit.model)]
-            best = as_measured(best)
-            stages.append(fit_stage("closed", best, measured, profile_intervals(best), names))
-        fit = best
+            own = fit_stage("closed", fit, measured, profile_intervals(fit), names)
+            best = as_measured(self.confirmed(fit, confirming))
+            if best.point is not fit.point:
+                own = fit_stage("closed", best, measured, profile_intervals(best), names)
+            fit = best
+            stages.append(own)
         diagnosis = replace(diagnosis, fit=fit)
         validated = diagnosis.validation
         told = validated.complete and not diagnosis.added and fit.has_points
@@ -328,10 +330,8 @@ class _Run:
         """The fit on a fine enough mesh, or as it is on the declared one."""
         return fit if self.config.model.n else fine_enough(fit, fit.model.n, modes)
 
-    def confirmed(self, fit: Fit, confirming: Callable[[], fitting.Minimum] | None) -> Fit:
-        """Compare a fit with the minimum that IPOPT has found in the meantime, if it was asked."""
-        if confirming is None:
-            return fit
+    def confirmed(self, fit: Fit, confirming: Callable[[], fitting.Minimum]) -> Fit:
+        """Compare a fit with the minimum that IPOPT has found in the meantime."""
         found = confirming()
         self.seconds["batch"] += found.seconds
         return fitting.confirmed(fit, found)

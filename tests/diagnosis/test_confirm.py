@@ -19,7 +19,16 @@ from dlo_casadi.diagnosis.screening import Screen, _Moving
 from dlo_casadi.diagnosis.selection import p_of_evidence
 from dlo_casadi.diagnosis.trials import Trials, judged
 from dlo_casadi.diagnosis.unknown_force import _Search
-from dlo_casadi.effects import EFFECTS, CableData, ClipOffset, LengthError, LumpedMass, UnknownPull
+from dlo_casadi.effects import (
+    EFFECTS,
+    CableData,
+    ClipOffset,
+    LengthError,
+    LumpedMass,
+    PointForce,
+    Tether,
+    UnknownPull,
+)
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import refit
@@ -283,3 +292,29 @@ def test_a_search_that_fails_leaves_it_to_that_from_the_measured_shapes(base, mo
     assert asked == [False, True]
     with pytest.raises(EstimationError, match="lost"):
         search.best(NEAR)
+
+
+def test_a_dead_force_is_handed_on_to_a_tether_whose_anchor_would_be_too_far():
+    """Its linear fit ends at a stiffness of zero; stiffness and anchor have to stay a pair."""
+    cable = CableData(0.6, 0.08, 0.008, 0.012, straight=True)
+    model = CableModel(cable, 12, start="clamped", end="free", n_rest=0)
+    pulled = model.with_effect(PointForce())
+    known = {"point_force.position": 0.4, "point_force.fx": 0.05, "point_force.fy": 0.1}
+    p = np.array([known.get(x, y) for x, y in zip(pulled.names, pulled.nominal, strict=True)])
+    poses = [HeldPose((0.0, 0.0), None, h, name=f"{h:g}") for h in (-2.4, -1.4, -0.8)]
+    s = np.linspace(0.06, 0.6, 8)
+    measured = [
+        MeasuredPose.of_points(x, y.curve.at(s), s=s)
+        for x, y in zip(poses, predict_poses(pulled, p, np.zeros(12), poses), strict=True)
+    ]
+    base = fit_model(model, measured, Tolerances(), 4e-4)
+    larger = model.with_effect(Tether())
+    given = {"tether.position": 0.4, "tether.stiffness": 0.1, "tether.anchor_x": 0.5}
+    begun, values = refits._in_linear(base, larger, given, np.inf)
+    assert not {"tether.stiffness", "tether.anchor_x"} & {*begun.model.names}
+    assert begun.value("tether_linear.stiffness") < values["tether.stiffness"]
+    for axis in "xy":
+        force = values["tether.stiffness"] * values[f"tether.anchor_{axis}"]
+        assert force == pytest.approx(begun.value(f"tether_linear.f{axis}"))
+    fit = refits.followed(base, larger, given)
+    assert fit.point.objective < begun.point.objective + 1.0

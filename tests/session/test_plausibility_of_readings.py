@@ -272,6 +272,16 @@ def test_what_shapes_leave_uncertain_is_free():
     assert misread([replace(one, uncertain=constant[..., None])], sized=False) == ()
     turned = replace(one, measured=-one.measured, uncertain=constant[..., None])
     assert "with the other sign" in misread([turned], sized=False)[0].message
+    # A part along the model is free only if two standard deviations may turn its sign.
+    across = rng.normal(size=(6, 1))
+    across -= model * (across * model).sum() / (model**2).sum()
+    across *= 0.7 * np.linalg.norm(model) / np.linalg.norm(across)
+    turning = across + model
+    read = replace(one, measured=model - 1.4 * turning, uncertain=turning[..., None])
+    assert misread([read], sized=False) == ()
+    beside = across + 0.3 * model
+    read = replace(one, measured=0.1 * beside - model, uncertain=beside[..., None])
+    assert "with the other sign" in misread([read], sized=False)[0].message
     # Nothing is judged of what the shapes leave open altogether.
     every = rng.normal(size=(6, 1, 9))
     assert misread([replace(one, uncertain=every)], sized=False) == ()
