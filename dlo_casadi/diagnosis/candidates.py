@@ -70,13 +70,14 @@ class Candidate:
     def of_linear(self, cable: CableData, values: Mapping[str, float]) -> dict[str, float]:
         """Qualified parameters, within their bounds, from those used for screening."""
         prefix = f"{self.effect.label}."
-        own = self.effect.of_linear(
-            cable, {name.removeprefix(prefix): value for name, value in values.items()}
-        )
-        return {
-            prefix + q.name: float(np.clip(own[q.name], q.lower, q.upper))
-            for q in self.effect.parameters(cable)
-        }
+        own = {name.removeprefix(prefix): value for name, value in values.items()}
+        return of_linear(self.effect, cable, own)
+
+
+def of_linear(effect: Effect, cable: CableData, values: Mapping[str, float]) -> dict[str, float]:
+    """Qualified parameters of an effect, within their bounds, from those of its `linear` one."""
+    own, each = effect.of_linear(cable, values), effect.parameters(cable)
+    return {f"{effect.label}.{q.name}": float(np.clip(own[q.name], q.lower, q.upper)) for q in each}
 
 
 def setup_of(model: CableModel, **seen: Any) -> Setup:

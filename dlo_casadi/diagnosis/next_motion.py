@@ -49,8 +49,7 @@ ASIDE, ASIDE_HELD = 0.25, 0.05
 DURATION, RATE, POINTS = 3.0, 100.0, 10
 # Share of the slowest rate of a cable below which nothing holds a mode.
 FREE = 0.05
-# Modes that are compared, and poses that are tried at most. Of 12 poses the one whose rates differ
-# most separated rivals no better than that of 4 in six of eight simulated sessions.
+# Modes that are compared, and poses that are tried at most: more hardly separate rivals better.
 MODES, TRIED = 3, 4
 
 

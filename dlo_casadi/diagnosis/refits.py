@@ -20,7 +20,7 @@ from functools import partial
 import casadi as ca
 import numpy as np
 
-from dlo_casadi.diagnosis.candidates import Candidate
+from dlo_casadi.diagnosis.candidates import Candidate, of_linear
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.from_data import (
     NEAR_NOISE,
@@ -270,18 +270,16 @@ def _in_linear(
             continue
         # Of another label, so that no value of the effect itself is taken from this fit.
         linear = replace(effect.linear(), label=f"{effect.label}_linear")
-        of_linear = f"{linear.label}."
+        own = f"{linear.label}."
         other = replace(model, effects=tuple(linear if x is effect else x for x in model.effects))
-        given = {**values, **{of_linear + name: value for name, value in given.items()}}
+        given = {**values, **{own + name: value for name, value in given.items()}}
         try:
             found = refit(start, other, values=given, tolerance=NEARLY, ceiling=ceiling)
         except EstimationError:
             continue
         names = (q.name for q in linear.parameters(cable))
-        own = effect.of_linear(cable, {name: found.value(of_linear + name) for name in names})
-        clipped = {q.name: float(np.clip(own[q.name], q.lower, q.upper)) for q in each}
-        start = found
-        values = {**values, **{prefix + name: value for name, value in clipped.items()}}
+        reached = {name: found.value(own + name) for name in names}
+        start, values = found, {**values, **of_linear(effect, cable, reached)}
     return start, values
 
 

@@ -1,19 +1,31 @@
 """The let-go that separates models of the same still shapes."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 import dlo_casadi as dlo
+from dlo_casadi.diagnosis import next_motion as next_motion_module
 from dlo_casadi.diagnosis.next_motion import (
     ASIDE,
     DURATION,
     RATE,
     NextMotion,
+    _modes_of,
     _variances,
     next_motion,
 )
-from dlo_casadi.effects import CableData, Effect, ImageScale, LumpedMass, PointForce
+from dlo_casadi.effects import (
+    CableData,
+    Effect,
+    ImageScale,
+    LumpedMass,
+    PointForce,
+    RestCurvatureDrift,
+)
 from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.motion_fit import fit_motions
 from dlo_casadi.estimation.prediction import predict_poses
@@ -52,6 +64,22 @@ def fitted(measured: list[MeasuredPose], effect: Effect) -> Fit:
 def values_of(model: CableModel, place: str, **known: float) -> np.ndarray:
     known |= {place: PLACE}
     return np.array([known.get(x, y) for x, y in zip(model.names, model.nominal, strict=True)])
+
+
+def test_each_pose_starts_at_its_own_shape_where_others_leave_a_state(monkeypatch) -> None:
+    """A problem with a state has the shapes of held-out poses, too."""
+    model, known = MODEL.with_effect(RestCurvatureDrift()), {}
+    x = np.arange(4.0)[:, None, None] * np.ones((4, MODEL.chain.n_nodes, 1))
+    held = [HeldPose((0.0, 0.0), None, 0.1 * k, name=str(k)) for k in (1, 3)]
+    problem = SimpleNamespace(used=[1, 3], fit_poses=[SimpleNamespace(pose=y) for y in held])
+    given = {"model": model, "p": model.nominal, "rest_now": np.zeros(MODEL.chain.n_rests)}
+    point = SimpleNamespace(shapes=SimpleNamespace(x=x))
+    lost = [EquilibriumError("lost")] * 2
+    monkeypatch.setattr(
+        next_motion_module, "solve_equilibria", lambda *args: known.update(starts=args[-1]) or lost
+    )
+    _modes_of(SimpleNamespace(problem=problem, point=point, **given), [0, 1])
+    assert [start[0, 0] for start in known["starts"]] == [1.0, 3.0]
 
 
 def test_a_rate_is_known_as_well_as_linear_least_squares_knows_it() -> None:
